@@ -1,0 +1,156 @@
+import pytest
+import torch
+
+from torchcmax.core.minimize import Stop, minimize
+
+EXACT = Stop(tolerance=1e-7, iterations=200, longest=1e9)
+
+
+def quadratic(A, centre):
+    """1/2 (x - c)^T A (x - c) for each problem."""
+
+    def objective(x, rows):
+        g = (A[rows] @ (x - centre[rows])[..., None])[..., 0]
+        return 0.5 * (g * (x - centre[rows])).sum(-1), g
+
+    return objective
+
+
+def rosenbrock(x, rows):
+    x = x.detach().requires_grad_()
+    with torch.enable_grad():
+        value = (1 - x[:, 0]) ** 2 + 100 * (x[:, 1] - x[:, 0] ** 2) ** 2
+        (gradient,) = torch.autograd.grad(value.sum(), x)
+    return value.detach(), gradient
+
+
+@pytest.fixture
+def problem():
+    g = torch.Generator().manual_seed(0)
+    M = torch.randn(6, 5, 5, generator=g, dtype=torch.float64)
+    return M @ M.mT + 0.1 * torch.eye(5), torch.randn(6, 5, generator=g, dtype=torch.float64)
+
+
+def test_quadratics_end_in_their_centres(problem):
+    A, centre = problem
+    found = minimize(quadratic(A, centre), torch.zeros_like(centre), stop=EXACT)
+    torch.testing.assert_close(found.x, centre, rtol=0, atol=1e-5)
+    assert found.converged.all()
+    assert (found.evaluations >= found.iterations + 1).all()
+
+
+def test_with_the_curvature_as_metric_a_quadratic_takes_a_handful_of_evaluations(problem):
+    A, centre = problem
+    found = minimize(quadratic(A, centre), torch.zeros_like(centre), A, EXACT)
+    torch.testing.assert_close(found.x, centre, rtol=0, atol=1e-6)
+    assert (found.evaluations <= 5).all()
+
+
+def test_a_curved_valley_is_followed_to_its_end():
+    start = torch.tensor([[-1.2, 1.0], [3.0, -2.0], [0.0, 5.0]], dtype=torch.float64)
+    found = minimize(rosenbrock, start, stop=Stop(tolerance=1e-8, iterations=200))
+    torch.testing.assert_close(found.x, torch.ones_like(start), rtol=0, atol=1e-5)
+
+
+def test_a_row_goes_the_same_way_alone_and_in_a_batch(problem):
+    A, centre = problem
+    together = minimize(quadratic(A, centre), torch.zeros_like(centre), stop=EXACT)
+    for i in range(len(A)):
+        alone = minimize(quadratic(A[i : i + 1], centre[i : i + 1]), torch.zeros_like(centre[:1]), stop=EXACT)
+        assert torch.equal(alone.x[0], together.x[i])
+        assert alone.evaluations[0] == together.evaluations[i]
+        assert alone.iterations[0] == together.iterations[i]
+
+
+def test_torch_lbfgs_finds_the_same_minimum(problem):
+    """The one-row cross-check: torch.optim.LBFGS with strong Wolfe conditions."""
+    A, centre = problem
+    ours = minimize(rosenbrock, torch.tensor([[-1.2, 1.0]], dtype=torch.float64), stop=Stop(tolerance=1e-8, iterations=200))
+    x = torch.tensor([[-1.2, 1.0]], dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([x], max_iter=200, line_search_fn="strong_wolfe", tolerance_grad=1e-10, tolerance_change=1e-14)
+
+    def closure():
+        value, x.grad = rosenbrock(x, torch.zeros(1, dtype=torch.int64))
+        return value.sum()
+
+    optimizer.step(closure)
+    torch.testing.assert_close(ours.x, x.detach(), rtol=0, atol=1e-5)
+
+
+def test_rows_that_are_done_are_not_evaluated_again(problem):
+    A, centre = problem
+    calls = torch.zeros(len(A), dtype=torch.int64)
+    inner = quadratic(A, centre)
+
+    def counting(x, rows):
+        calls[rows] += 1
+        return inner(x, rows)
+
+    start = torch.zeros_like(centre)
+    start[2] = centre[2]  # done before it begins
+    found = minimize(counting, start, stop=EXACT)
+    assert torch.equal(calls, found.evaluations)
+    assert found.evaluations[2] == 1
+    assert found.converged[2]
+    assert found.iterations[2] == 0
+
+
+def test_the_arguments_are_not_changed(problem):
+    A, centre = problem
+    start, metric = torch.zeros_like(centre), torch.eye(5, dtype=torch.float64).repeat(6, 1, 1)
+    minimize(quadratic(A, centre), start, metric, EXACT)
+    assert (start == 0).all()
+    assert torch.equal(metric, torch.eye(5, dtype=torch.float64).repeat(6, 1, 1))
+
+
+def test_the_trace_goes_down_and_ends_at_the_value(problem):
+    A, centre = problem
+    found = minimize(quadratic(A, centre), torch.zeros_like(centre), stop=EXACT)
+    assert (found.trace.diff(dim=1) <= 1e-12).all()
+    torch.testing.assert_close(found.trace[:, -1], found.value)
+
+
+def test_no_step_is_longer_than_allowed(problem):
+    A, centre = problem
+    points = []
+    inner = quadratic(A[:1], 100 * centre[:1])
+
+    def watching(x, rows):
+        points.append(x[0].clone())
+        return inner(x, rows)
+
+    minimize(watching, torch.zeros(1, 5, dtype=torch.float64), stop=Stop(longest=3.0, iterations=10))
+    path = torch.stack(points)
+    assert (path - path[0]).norm(dim=-1).max() <= 10 * 3.0
+    assert (path.diff(dim=0).norm(dim=-1) <= 3.0 + 1e-9).all()
+
+
+def test_a_row_that_may_not_iterate_enough_says_so():
+    found = minimize(rosenbrock, torch.tensor([[-1.2, 1.0]], dtype=torch.float64), stop=Stop(tolerance=1e-8, iterations=3))
+    assert not found.converged[0]
+    assert found.iterations[0] == 3
+
+
+def test_a_row_of_nan_stands_still_and_harms_no_other(problem):
+    A, centre = problem
+    inner = quadratic(A, centre)
+
+    def broken(x, rows):
+        value, gradient = inner(x, rows)
+        return torch.where(rows == 1, torch.nan, value), torch.where((rows == 1)[:, None], torch.nan, gradient)
+
+    found = minimize(broken, torch.zeros_like(centre), stop=EXACT)
+    assert not found.converged[1]
+    assert (found.x[1] == 0).all()
+    torch.testing.assert_close(found.x[2:], centre[2:], rtol=0, atol=1e-5)
+
+
+def test_a_wall_of_infinity_is_backed_away_from():
+    def log_barrier(x, rows):
+        inside = x[:, 0] < 1
+        safe = torch.where(inside, x[:, 0], 0.0)
+        value = torch.where(inside, -x[:, 0] - 0.1 * (1 - safe).log(), torch.inf)
+        return value, torch.where(inside, -1 + 0.1 / (1 - safe), torch.nan)[:, None]
+
+    found = minimize(log_barrier, torch.zeros(1, 1, dtype=torch.float64), stop=Stop(tolerance=1e-6))
+    torch.testing.assert_close(found.x, torch.full((1, 1), 0.9, dtype=torch.float64), rtol=0, atol=1e-4)

@@ -1,0 +1,123 @@
+"""Camera: sensor pixel -> ray, through a look-up table; Canvas: ray -> pixel of an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+MODELS = {"plumb_bob": 5, "kannala_brandt": 4}
+TABLE_ERROR = 1e-3  # px: what the look-up table may be off, measured by projecting it again
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole with lens distortion.  size (H, W) px; pixel centres at integers.
+
+    distortion: plumb_bob (k1, k2, p1, p2, k3), as OpenCV and ROS; kannala_brandt (k1, k2, k3, k4), as OpenCV's fisheye.
+    """
+
+    size: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    model: str = "plumb_bob"
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f"camera model {self.model!r} is none of {', '.join(MODELS)}")
+        if len(self.distortion) != MODELS[self.model]:
+            raise ValueError(f"{self.model} wants {MODELS[self.model]} distortion numbers, got {len(self.distortion)}")
+        numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        if not numbers.isfinite().all() or min(self.fx, self.fy, *self.size) <= 0:
+            raise ValueError(f"a camera wants finite numbers, a positive focal length and size, got {self}")
+
+    @classmethod
+    def pinhole(cls, size: tuple[int, int], focal_by_width: float = 1.2) -> Camera:
+        """A stand-in where no calibration is known: focal length as a multiple of the width, centre in the middle."""
+        (height, width), focal = size, focal_by_width * size[1]
+        return cls(size, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    def _kornia(self) -> tuple[Tensor, Tensor]:
+        """Intrinsic matrix [3, 3] and distortion coefficients, as kornia wants them."""
+        k = torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=torch.float64)
+        return k, torch.tensor(self.distortion, dtype=torch.float64)
+
+    def project(self, ray: Tensor) -> Tensor:
+        """Rays to distorted sensor pixels: ray [M, 3] -> [M, 2] px."""
+        from kornia.geometry import calibration, camera  # 0.5 s, so only where it is needed
+
+        k, coefficients = self._kornia()
+        point = (ray[..., :2] / ray[..., 2:]).double()
+        if self.model == "plumb_bob":
+            pixel = point * k.diagonal()[:2] + k[:2, 2]
+            return calibration.distort_points(pixel[None], k[None], coefficients[None])[0].to(ray)
+        params = torch.tensor([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=torch.float64)
+        return camera.distort_points_kannala_brandt(point, params).to(ray)
+
+    def rays(self) -> Tensor:
+        """Ray (x, y, 1) of every sensor pixel, exact to 1e-3 px: -> [H, W, 3] float64, computed once per camera."""
+        return _table(self)
+
+
+@lru_cache(maxsize=16)
+def _table(camera: Camera) -> Tensor:
+    height, width = camera.size
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixel = torch.stack([x, y], -1).reshape(-1, 2).double()
+    point = _undistort(camera, pixel)
+    ray = torch.cat([point, torch.ones_like(point[:, :1])], -1)
+    error = (camera.project(ray) - pixel).abs().amax(-1)
+    if not (error < TABLE_ERROR).all():
+        worst = int(error.nan_to_num(torch.inf).argmax())
+        raise ValueError(
+            f"the lens model cannot be inverted at pixel ({int(pixel[worst, 0])}, {int(pixel[worst, 1])}), "
+            f"off by {error[worst].item():.3g} px: the calibration does not belong to a sensor of {width} x {height}, or the lens sees beyond 90 degrees"
+        )
+    return ray.view(height, width, 3)
+
+
+def _undistort(camera: Camera, pixel: Tensor) -> Tensor:
+    """Distorted pixels [M, 2] to points on the plane z = 1, by kornia with enough rounds for the table's error."""
+    from kornia.geometry import calibration
+    from kornia.geometry.camera import undistort_points_kannala_brandt
+
+    k, coefficients = camera._kornia()
+    if camera.model == "kannala_brandt":
+        params = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion], dtype=torch.float64)
+        return undistort_points_kannala_brandt(pixel, params)
+    flat = calibration.undistort_points(pixel[None], k[None], coefficients[None], num_iters=100)[0]
+    return (flat - k[:2, 2]) / k.diagonal()[:2]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """An image plane in front of a camera: focal px per unit tangent, centre (x, y) px, size (H, W)."""
+
+    focal: float
+    centre: tuple[float, float]
+    size: tuple[int, int]
+
+    @classmethod
+    def around(cls, camera: Camera, margin: float = 0.25) -> Canvas:
+        """The undistorted sensor with a margin on each side, a share of the sensor's size, so that warped events stay on it.
+
+        One canvas pixel is one sensor pixel in the middle of the image.
+        """
+        (height, width), focal = camera.size, (camera.fx * camera.fy) ** 0.5
+        top, left = round(margin * height), round(margin * width)
+        return cls(focal, (camera.cx + left, camera.cy + top), (height + 2 * top, width + 2 * left))
+
+    def scaled(self, factor: float) -> Canvas:
+        """The same view in a smaller image: factor 0.5 makes one pixel of two by two."""
+        x, y = ((c + 0.5) * factor - 0.5 for c in self.centre)
+        height, width = (round(n * factor) for n in self.size)
+        return Canvas(self.focal * factor, (x, y), (height, width))
+
+    def pixels(self, ray: Tensor) -> Tensor:
+        """Rays to image points: ray [..., 3], z > 0 -> [..., 2] px."""
+        return ray[..., :2] / ray[..., 2:] * self.focal + ray.new_tensor(self.centre)

@@ -1,0 +1,91 @@
+"""The image of warped events: events + homographies + canvas -> image, with the gradient to the homographies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcmax.core.camera import Canvas
+from torchcmax.core.vote import slopes, vote_scatter, votes
+from torchcmax.core.warp import TERMS, monomials, warp
+from torchcmax.core.window import Window
+
+NEAREST = 1e-3  # depth of a warped ray below which it counts as behind the camera
+
+
+@dataclass(frozen=True)
+class Ink:
+    """Windows made ready for many warps: basis [W, 3K, N] of `monomials` | weight [W, N], 0 for padding."""
+
+    basis: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, window: Window, reference: float = 0.5, signed: bool = False) -> Ink:
+        """reference: the time warped to, 0 the window's first event, 1 its last | signed: events vote with their polarity (2.1)."""
+        basis = monomials(window.ray, window.phase - reference, TERMS)
+        return cls(basis, window.polarity if signed else window.weight)
+
+
+def draw_twin(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
+    """The readable twin of `draw`, in plain torch operations."""
+    ray = warp(H_k, ink.basis[owner]).mT
+    ahead = ray[..., 2] > NEAREST
+    xy = canvas.pixels(torch.where(ahead[..., None], ray, ray.new_ones(3)))
+    return vote_scatter(xy, ink.weight[owner] * ahead, canvas.size)
+
+
+def draw(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
+    """Warp events and vote them into images, eq. (2.1): one image for each homography.
+
+    H_k [A, K, 3, 3] | ink of W windows | owner [A] int: the window that each homography belongs to -> [A, H, W]
+
+    Differentiable to H_k, once. On the CPU each row is computed by itself, in the cache and the same in any batch.
+    """
+    if ink.basis.is_cuda and torch.are_deterministic_algorithms_enabled():
+        return draw_twin(H_k, ink, canvas, owner)
+    image: Tensor = _Draw.apply(H_k.transpose(1, 2).flatten(2), ink, canvas, owner)
+    return image
+
+
+def _portions(ink: Ink, owner: Tensor) -> list[tuple[slice, Tensor, Tensor]]:
+    """Rows to compute together, with their basis and weight: one at a time on the CPU, all at once on a GPU."""
+    if ink.basis.is_cuda:
+        return [(slice(None), ink.basis[owner], ink.weight[owner])]
+    return [(slice(i, i + 1), ink.basis[w : w + 1], ink.weight[w : w + 1]) for i, w in enumerate(owner.tolist())]
+
+
+def _project(flat: Tensor, basis: Tensor, weight: Tensor, canvas: Canvas) -> tuple[Tensor, Tensor, Tensor]:
+    """flat [A, 3, 3K] -> focal / depth [A, 1, N], offset from the canvas' centre [A, 2, N] px, weight [A, N] or 0 if behind."""
+    ray = flat @ basis
+    ahead = ray[:, 2:] > NEAREST
+    scale = canvas.focal / torch.where(ahead, ray[:, 2:], 1.0)
+    return scale, ray[:, :2] * scale, weight * ahead[:, 0]
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, flat: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
+        ctx.save_for_backward(flat)
+        ctx.rest = ink, canvas, owner
+        image = flat.new_empty(len(flat), *canvas.size)
+        for rows, basis, weight in _portions(ink, owner):
+            _, offset, weight = _project(flat[rows], basis, weight, canvas)
+            image[rows] = votes(offset.mT + flat.new_tensor(canvas.centre), weight, canvas.size)
+        return image
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+        (flat,) = ctx.saved_tensors
+        ink, canvas, owner = ctx.rest
+        result = torch.empty_like(flat)
+        for rows, basis, weight in _portions(ink, owner):
+            scale, offset, weight = _project(flat[rows], basis, weight, canvas)
+            slope = slopes(gradient[rows], offset.mT + flat.new_tensor(canvas.centre), weight).mT
+            to_ray = torch.cat([slope, -(slope * offset).sum(1, keepdim=True) / canvas.focal], 1) * scale
+            result[rows] = to_ray @ basis.mT
+        return result, None, None, None
