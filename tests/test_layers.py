@@ -58,5 +58,7 @@ def test_importing_the_package_loads_nothing_heavy():
     for path in [ROOT / "__init__.py", *(ROOT / "core").glob("*.py"), *(ROOT / "io").glob("*.py")]:
         top = ast.parse(path.read_text()).body
         for node in top:
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
+            names = (
+                [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
+            )
             assert not heavy & {name.split(".")[0] for name in names if name}, f"{path} imports {names} before it is needed"

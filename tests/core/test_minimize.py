@@ -62,9 +62,8 @@ def test_a_row_goes_the_same_way_alone_and_in_a_batch(problem):
         assert alone.iterations[0] == together.iterations[i]
 
 
-def test_torch_lbfgs_finds_the_same_minimum(problem):
+def test_torch_lbfgs_finds_the_same_minimum():
     """The one-row cross-check: torch.optim.LBFGS with strong Wolfe conditions."""
-    A, centre = problem
     ours = minimize(rosenbrock, torch.tensor([[-1.2, 1.0]], dtype=torch.float64), stop=Stop(tolerance=1e-8, iterations=200))
     x = torch.tensor([[-1.2, 1.0]], dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.LBFGS([x], max_iter=200, line_search_fn="strong_wolfe", tolerance_grad=1e-10, tolerance_change=1e-14)

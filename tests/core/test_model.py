@@ -80,9 +80,7 @@ def test_the_twin_moves_the_image_alike_and_its_twin_is_the_first(rand, close):
     assert (other.normal - d.normal).norm(dim=-1).min() > 0.1
     ray = torch.cat([rand(3, 40, 2) - 0.5, torch.ones_like(rand(3, 40, 1))], -1)
     end = torch.full_like(ray[..., 0], 0.5)
-    moved = [
-        pixels(transfer(ray, Motion(m.turn, m.shift).at(end), Plane(m.normal, torch.ones_like(m.turn[:, 0])))) for m in (d, other)
-    ]
+    moved = [pixels(transfer(ray, Motion(m.turn, m.shift).at(end), Plane(m.normal, torch.ones_like(m.turn[:, 0])))) for m in (d, other)]
     step = (moved[0] - pixels(ray)).norm(dim=-1).max()
     assert (moved[0] - moved[1]).norm(dim=-1).max() < 0.02 * step  # equal to first order
 

@@ -30,7 +30,9 @@ def test_log_undoes_exp_up_to_half_a_turn(rotvec, dtype):
 
 def test_log_of_exactly_half_a_turn_has_that_length(dtype, device):
     half = torch.tensor([[math.pi, 0, 0], [0, math.pi, 0], [0, 0, math.pi]], dtype=dtype, device=device)
-    torch.testing.assert_close(so3.log(so3.exp(half)).norm(dim=-1), torch.full((3,), math.pi, dtype=dtype, device=device), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        so3.log(so3.exp(half)).norm(dim=-1), torch.full((3,), math.pi, dtype=dtype, device=device), rtol=1e-4, atol=0
+    )
 
 
 def test_quaternions_turn_into_matrices_and_back(rotvec, close):

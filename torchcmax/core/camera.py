@@ -76,7 +76,8 @@ def _table(camera: Camera) -> Tensor:
         worst = int(error.nan_to_num(torch.inf).argmax())
         raise ValueError(
             f"the lens model cannot be inverted at pixel ({int(pixel[worst, 0])}, {int(pixel[worst, 1])}), "
-            f"off by {error[worst].item():.3g} px: the calibration does not belong to a sensor of {width} x {height}, or the lens sees beyond 90 degrees"
+            f"off by {error[worst].item():.3g} px: "
+            f"the calibration does not belong to a sensor of {width} x {height}, or the lens sees beyond 90 degrees"
         )
     return ray.view(height, width, 3)
 

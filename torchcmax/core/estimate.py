@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchcmax.core.camera import Camera, Canvas
-from torchcmax.core.draw import Ink
 from torchcmax.core.minimize import Minimum, Stop, minimize
 from torchcmax.core.model import Displacement, Model
 from torchcmax.core.objective import REFERENCES, Look, metric, objective

@@ -115,7 +115,9 @@ def _aim(gradient: Tensor, inverse: Tensor, metric: Tensor, stop: Stop) -> tuple
 
 def _between(guess: Tensor, low: Tensor, high: Tensor, limit: Tensor) -> Tensor:
     """The next length to try: the guess, kept off the ends of the bracket; twice the last while there is no upper end."""
-    bracketed = low + torch.minimum(torch.maximum((guess - low) / (high - low), guess.new_tensor(0.1)), guess.new_tensor(0.5)) * (high - low)
+    bracketed = low + torch.minimum(torch.maximum((guess - low) / (high - low), guess.new_tensor(0.1)), guess.new_tensor(0.5)) * (
+        high - low
+    )
     return torch.where(high.isinf(), torch.minimum(2 * low, limit), bracketed.nan_to_num(0.5))
 
 

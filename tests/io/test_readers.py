@@ -1,0 +1,317 @@
+"""What is written comes back, from every form and across every border of chunks; the recordings at hand open."""
+
+import dataclasses
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcmax.core import so3
+from torchcmax.core.camera import Camera
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Motion, Pose, Trajectory
+from torchcmax.io import DataError, DataWarning, Events, OpenOptions, Recording, open, save
+from torchcmax.io.checked import Source, checked
+from torchcmax.io.text import read_text
+from torchcmax.io.trajectory import read_plane, read_trajectory, write_plane, write_trajectory, write_velocity
+
+ECD = "199.09 198.83 132.19 110.71 -0.3684 0.1509 -0.000296 -0.000759 0.0\n"
+DAVIS = Camera((180, 240), 199.09, 198.83, 132.19, 110.71, (-0.3684, 0.1509, -0.000296, -0.000759, 0.0))
+FISHEYE = Camera((60, 80), 40.0, 41.0, 39.5, 29.5, (0.01, -0.002, 0.0003, 0.0), "kannala_brandt")
+
+
+@st.composite
+def streams(draw):
+    """Valid events: times in order, often equal, from below zero to the epoch's."""
+    steps = draw(st.lists(st.sampled_from([0, 0, 1, 7, 999_999, 10**7]), min_size=1, max_size=40))
+    t = np.cumsum([draw(st.sampled_from([-5, 0, 13_595_875, 1_468_940_293_844_896])), *steps[1:]])
+    x, y, p = (draw(st.lists(st.integers(0, most), min_size=len(t), max_size=len(t))) for most in (239, 179, 1))
+    return Events(t.astype("i8"), np.array(x, "u2"), np.array(y, "u2"), np.array(p, "u1"))
+
+
+def same(left, right):
+    for field in dataclasses.fields(Events):
+        a, b = getattr(left, field.name), getattr(right, field.name)
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def as_text(events, end="\n", off=0):
+    rows = zip(*(getattr(events, name).tolist() for name in "txyp"), strict=True)
+    sign = [("-" if t < 0 else "", *divmod(abs(t), 10**6), x, y, p or off) for t, x, y, p in rows]
+    return "".join(f"{s}{whole}.{part:06d} {x} {y} {p}{end}" for s, whole, part, x, y, p in sign)
+
+
+def back(path, chunk, **options):
+    recording = open(path, OpenOptions(chunk=chunk, sensor=(240, 180), **options))
+    chunks = list(recording.chunks())
+    assert all(len(part) == chunk for part in chunks[:-1])
+    return Events.join(chunks)
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams(), st.integers(1, 9), st.sampled_from(["\n", "\r\n"]), st.sampled_from([0, -1]), st.sampled_from(["", "# t x y p\n"]))
+def test_text_and_zip_come_back_exactly(tmp_path_factory, events, chunk, end, off, head):
+    folder = tmp_path_factory.mktemp("ecd")
+    (folder / "events.txt").write_bytes((head + as_text(events, end, off)).encode())
+    (folder / "calib.txt").write_text(ECD)
+    same(back(folder, chunk), events)
+    same(back(folder / "events.txt", chunk), events)
+    for inside in ("", "shapes/"):
+        with zipfile.ZipFile(folder / "r.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+            for name in ("events.txt", "calib.txt"):
+                archive.write(folder / name, inside + name)
+        same(back(folder / "r.zip", chunk), events)
+        assert open(folder / "r.zip", OpenOptions(sensor=(240, 180))).camera == DAVIS
+    assert sorted(entry.name for entry in folder.iterdir()) == ["calib.txt", "events.txt", "r.zip"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams(), st.integers(1, 9), st.integers(1, 60))
+def test_blocks_of_any_size_give_the_same_events(tmp_path_factory, events, chunk, block):
+    file = tmp_path_factory.mktemp("text") / "events.txt"
+    file.write_text(as_text(events))
+    same(Events.join(list(read_text(file, chunk, block))), events)
+
+
+@settings(max_examples=40, deadline=None)
+@given(streams(), st.integers(1, 9), st.sampled_from(["i8", "u2", "i4"]), st.sampled_from([0, -1]))
+def test_both_hdf5_layouts_come_back_exactly(tmp_path_factory, events, chunk, kind, off):
+    folder = tmp_path_factory.mktemp("sim")
+    (folder / "calib.txt").write_text(ECD)
+    with h5py.File(folder / "events.h5", "w") as file:
+        for name in "txyp":
+            file[f"events/{name}"] = getattr(events, name).astype({"t": "i8", "p": "i1"}.get(name, kind))
+        file["events/p"][()] = np.where(events.p, 1, off)
+    same(back(folder, chunk), events)
+    same(back(folder / "events.h5", chunk), events)
+    recording = open(folder, OpenOptions(chunk=chunk, sensor=(240, 180)))
+    save(recording, folder / "own.data")
+    own = open(folder / "own.data", OpenOptions(chunk=chunk, strict=False))
+    same(Events.join(list(own.chunks())), events)
+    assert (own.camera, own.name, own.count) == (DAVIS, recording.name, len(events))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data(), st.integers(2, 12))
+def test_events_moved_by_less_than_a_chunk_are_put_back_stably(data, chunk):
+    count = data.draw(st.integers(1, 60))
+    t = np.array(data.draw(st.lists(st.integers(0, 30), min_size=count, max_size=count)))
+    t.sort()
+    reach = data.draw(st.lists(st.integers(0, chunk - 1), min_size=count, max_size=count))
+    order = np.argsort(np.arange(count) + reach, kind="stable")  # none passes more than chunk - 1 others
+    t = t[order]
+    events = Events(t, np.arange(count).astype("u2"), np.zeros(count, "u2"), np.zeros(count, "u1"))
+    source = Source("r", (100, 1), lambda event: f"event {event}")
+    raw = (events[i : i + chunk] for i in range(0, count, chunk))
+    late = int((t < np.maximum.accumulate(t)).sum())
+    if late:
+        with pytest.warns(DataWarning, match=f"{late} of {count} events"):
+            parts = list(checked(raw, source))
+    else:
+        parts = list(checked(raw, source))
+    same(Events.join(parts), events[np.argsort(t, kind="stable")])
+
+
+@pytest.mark.parametrize(
+    ("text", "microseconds"),
+    [
+        ("13.595874999000001", 13_595_875),
+        ("1468940293.844896", 1_468_940_293_844_896),
+        ("1468940293.8448964999", 1_468_940_293_844_896),
+        ("0.9999996", 1_000_000),
+        ("2.09714", 2_097_140),
+        ("3", 3_000_000),
+        (".5", 500_000),
+        ("1.", 1_000_000),
+        ("-0.25", -250_000),
+        ("1.5e-3", 1_500),
+    ],
+)
+def test_times_are_exact_to_the_microsecond(tmp_path, text, microseconds):
+    (tmp_path / "events.txt").write_text(f"{text} 1 2 1\n")
+    assert next(read_text(tmp_path / "events.txt", 10)).t.tolist() == [microseconds]
+
+
+def test_tabs_spaces_and_floats_that_are_whole_are_read(tmp_path):
+    (tmp_path / "events.txt").write_text("0.1\t1\t2\t1\n0.2   3 4  0 \n\n1e-1 1.0e+01 4.0 1.0\n")
+    events = next(read_text(tmp_path / "events.txt", 10))
+    assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == ([1, 3, 10], [2, 4, 4], [1, 0, 1])
+
+
+def sensor_of(folder, **options):
+    height, width = open(folder, OpenOptions(**options)).camera.size
+    return width, height
+
+
+def test_the_sensor_is_told_by_options_then_a_picture_then_the_events(tmp_path):
+    (tmp_path / "events.txt").write_text("0.1 100 2 1\n")
+    (tmp_path / "calib.txt").write_text(ECD)
+    assert sensor_of(tmp_path) == (240, 180)
+    assert sensor_of(tmp_path, camera="pinhole") == (128, 128)
+    (tmp_path / "events.txt").write_text("0.1 300 2 1\n")
+    assert sensor_of(tmp_path) == (304, 240)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "frame_1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + struct.pack(">II", 320, 200))
+    assert sensor_of(tmp_path) == (320, 200)
+    assert sensor_of(tmp_path, sensor=(250, 190)) == (250, 190)
+    (tmp_path / "images" / "frame_0.png").write_bytes(b"no picture")
+    assert sensor_of(tmp_path) == (304, 240)
+
+
+def test_a_camera_file_goes_before_calib_txt(tmp_path):
+    (tmp_path / "events.txt").write_text("0.1 1 2 1\n")
+    (tmp_path / "calib.txt").write_text(ECD)
+    file = tmp_path / "my.yaml"
+    text = "# mine\nmodel: kannala_brandt\nwidth: 80\nheight: 60\nfx: 40\nfy: 41\ncx: 39.5\ncy: 29.5\n"
+    file.write_text(text + "distortion: [0.01, -0.002, 3.0e-4, 0]\n")
+    assert open(tmp_path, OpenOptions(camera=str(file))).camera == FISHEYE
+    file.write_text("{width: 80, height: 60, fx: 40, fy: 40, cx: 39.5, cy: 29.5}")
+    assert open(tmp_path, OpenOptions(camera=str(file))).camera == Camera((60, 80), 40, 40, 39.5, 29.5)
+    file.write_text("# fx fy cx cy\n50 50 64 64")
+    assert open(tmp_path, OpenOptions(camera=str(file))).camera == Camera((128, 128), 50, 50, 64, 64)
+    assert open(tmp_path, OpenOptions(camera="pinhole")).camera == Camera.pinhole((128, 128))
+
+
+def a_trajectory():
+    generator = torch.Generator().manual_seed(0)
+    w, t = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64)
+    return Trajectory(torch.tensor([-1_500_000, -1, 0, 1, 999_999, 1_468_940_293_844_896]), Pose(so3.exp(w), t))
+
+
+def test_own_files_keep_truth_plane_and_camera(tmp_path):
+    plane = Plane(torch.tensor([[0.6, 0.0, -0.8]], dtype=torch.float64), torch.tensor([0.7], dtype=torch.float64))
+    events = Events(np.array([1]), np.array([2], "u2"), np.array([3], "u2"), np.array([1], "u1"))
+    save(Recording(tmp_path, "öl", FISHEYE, lambda: iter([events]), None, a_trajectory(), plane), tmp_path / "a.h5")
+    (tmp_path / "calib.txt").write_text("what stands beside a complete file is not its own")
+    found = open(tmp_path / "a.h5")
+    assert (found.camera, found.name, found.count) == (FISHEYE, "öl", 1)
+    assert torch.equal(found.truth.time, a_trajectory().time)
+    assert torch.equal(found.truth.pose.t, a_trajectory().pose.t)
+    torch.testing.assert_close(found.truth.pose.R, a_trajectory().pose.R, rtol=0, atol=1e-15)
+    assert torch.equal(found.plane.normal, plane.normal)
+    assert torch.equal(found.plane.distance, plane.distance)
+    assert [entry.name for entry in sorted(tmp_path.iterdir())] == ["a.h5", "calib.txt"]
+
+
+def test_a_recording_can_be_saved_over_itself(tmp_path):
+    events = Events(np.arange(9), np.arange(9).astype("u2"), np.zeros(9, "u2"), np.ones(9, "u1"))
+    save(Recording(tmp_path, "a", FISHEYE, lambda: iter([events])), tmp_path / "a.h5")
+    save(open(tmp_path / "a.h5", OpenOptions(chunk=2)), tmp_path / "a.h5")
+    same(Events.join(list(open(tmp_path / "a.h5").chunks())), events)
+
+
+def test_trajectories_and_planes_come_back(tmp_path):
+    write_trajectory(tmp_path / "t.txt", a_trajectory())
+    found = read_trajectory(tmp_path / "t.txt")
+    assert torch.equal(found.time, a_trajectory().time)
+    torch.testing.assert_close(found.pose.t, a_trajectory().pose.t, rtol=0, atol=1e-11)
+    torch.testing.assert_close(found.pose.R, a_trajectory().pose.R, rtol=0, atol=1e-11)
+    plane = Plane(torch.tensor([[0.6, 0.0, -0.8]], dtype=torch.float64), torch.tensor([0.7], dtype=torch.float64))
+    write_plane(tmp_path / "p.txt", plane)
+    assert torch.equal(read_plane(tmp_path / "p.txt").normal, plane.normal)
+    write_velocity(tmp_path / "v.txt", torch.tensor([1_500_000]), Motion(torch.tensor([[4.0, 5, 6]]), torch.tensor([[1.0, 2, 3]])))
+    assert (tmp_path / "v.txt").read_text().splitlines()[1] == "1.500000 1 2 3 4 5 6"
+    with pytest.raises(DataError, match="cannot be written"):
+        write_plane(tmp_path / "p.txt" / "below.txt", plane)
+
+
+POSE = " 0 0 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0" + POSE + "2" + POSE + "1" + POSE, "line 3: time does not increase"),
+        ("#\n0" + POSE + "0.0000004" + POSE, "line 3: time does not increase"),
+        ("0" + POSE + "1 2 3\n", "line 2: 3 columns instead of 8"),
+        ("0" + POSE + "a" + POSE, "line 2: not all are numbers"),
+        ("0" + POSE + "nan" + POSE, "line 2: a number out of all range"),
+        ("0" + POSE + "1 0 0 0 0 0 0 0\n", "line 2: .* no unit quaternion"),
+        ("0" + POSE, "holds 1 poses"),
+        ("", "holds 0 poses"),
+    ],
+)
+def test_bad_trajectories(tmp_path, text, words):
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(DataError, match=words):
+        read_trajectory(tmp_path / "t.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("0 0 -1", "3 columns"), ("0 0 -2 1", "no unit normal"), ("0 0 -1 -1", "positive"), ("", "0 lines")],
+)
+def test_bad_planes(tmp_path, text, words):
+    (tmp_path / "p.txt").write_text(text)
+    with pytest.raises(DataError, match=words):
+        read_plane(tmp_path / "p.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "first", "last", "size"),
+    [
+        ("real/ecd/boxes_rotation", 30_000, 49_006_624, 49_012_158, (180, 240)),
+        ("real/ecd/boxes_rotation_13s", 30_000, 13_582_596, 13_595_875, (180, 240)),
+        ("real/ecd/shapes_rotation_2s", 20_000, 2_097_134, 2_195_729, (180, 240)),
+        ("real/slider_depth", 50_000, 3_811, 174_156, (180, 240)),
+        ("real/dvs128/garfield", 202_235, 0, 738_000, (128, 128)),
+        ("sim/poster_translation_clean", 2_296_042, 807, 2_499_999, (180, 240)),
+        ("sim/rotation_panorama_sim", 5_099_145, 0, 5_999_999, (180, 240)),
+    ],
+)
+def test_the_recordings_at_hand_open(shared, name, count, first, last, size):
+    recording = open(shared / "data" / name, OpenOptions(camera="pinhole" if "dvs128" in name else ""))
+    events = Events.join(list(recording.chunks()))
+    assert (len(events), events.t[0], events.t[-1], recording.camera.size) == (count, first, last, size)
+    assert recording.name == Path(name).name
+    assert recording.count in (None, count)
+    assert (recording.truth is not None) == ("sim" in name or "slider" in name)
+    assert (recording.plane is not None) == ("poster" in name)
+    if "sim" in name:
+        assert recording.camera == DAVIS
+
+
+def test_the_simulators_file_alone_tells_camera_truth_and_plane(shared, tmp_path):
+    folder = shared / "data/sim/poster_translation_clean"
+    (tmp_path / "alone.h5").symlink_to(folder / "events.h5")
+    alone, whole = open(tmp_path / "alone.h5"), open(folder)
+    assert alone.camera == whole.camera
+    assert torch.equal(alone.truth.time, whole.truth.time)
+    torch.testing.assert_close(alone.truth.pose.t, whole.truth.pose.t, rtol=0, atol=1e-8)
+    torch.testing.assert_close(alone.plane.normal, whole.plane.normal, rtol=0, atol=1e-8)
+
+
+MEMORY = """
+import sys
+import torchcmax.io as io
+def peak():  # KiB; getrusage would also count what the parent held before it started this process
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM"))
+def read(name):
+    options = io.OpenOptions(camera="pinhole", sensor=(240, 180), chunk=1 << 16)
+    return sum(map(len, io.open(sys.argv[1] + name, options).chunks()))
+read("/small.txt")
+before = peak()
+print(read("/events.txt"), peak() - before)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory of one process is read from /proc")
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    block = "".join(f"{{}}.{i:06d} {i % 240} {i % 180} {i % 2}\n" for i in range(0, 1_000_000, 10))
+    with (tmp_path / "events.txt").open("w") as file:
+        file.writelines(block.replace("{}", str(second)) for second in range(30))
+    (tmp_path / "small.txt").write_text("0.1 1 2 1\n")
+    command = [sys.executable, "-c", MEMORY, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2])
+    count, grown = map(int, done.stdout.split())
+    assert count == 3_000_000
+    assert grown < 32 * 1024  # KiB; measured: 16 MiB, and 111 MiB where all events are held at once

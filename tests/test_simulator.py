@@ -1,0 +1,268 @@
+import dataclasses
+import math
+import resource
+from functools import cache
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from torchcmax.core import so3
+from torchcmax.core.camera import Canvas
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Pose
+from torchcmax.core.warp import transfer
+from torchcmax.io import opening
+from torchcmax.io.errors import DataError
+from torchcmax.io.recording import Events
+from torchcmax.simulator import MOTIONS, Simulation, pose, simulate, velocity, write
+from torchcmax.texture import texture
+
+SMALL = Simulation(duration=0.03, width=64, height=48, focal=55.0)
+SCENES = {
+    "poster": Simulation(duration=0.12),
+    "shapes": Simulation("shapes", duration=0.12),
+    "panorama": Simulation("panorama", "rotation", duration=0.1),
+}
+
+
+@cache
+def events(options):
+    return Events.join(list(simulate(options).chunks()))
+
+
+def same(a, b):
+    return len(a) == len(b) and all((getattr(a, k) == getattr(b, k)).all() for k in "txyp")
+
+
+def variance(options, window, scale):
+    """Variance of the image of events warped to the first one with `scale` times the true motion."""
+    time = torch.from_numpy(window.t * 1e-6)
+    true = pose(options, time)
+    move = true[:1].inverse() @ true
+    scaled = Pose(so3.exp(scale * so3.log(move.R)), scale * move.t)
+    seen = options.plane.seen_from(true[:1]) if options.plane else Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))
+    ray = options.camera.rays()[window.y.astype(int), window.x.astype(int)]
+    canvas = Canvas.around(options.camera)
+    xy = canvas.pixels(transfer(ray[None], scaled[None], seen))[0].numpy()
+    corner = np.floor(xy)
+    image = np.zeros(canvas.size)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            x, y = (corner + np.array([dx, dy])).astype(int).T
+            weight = np.prod(1 - np.abs(xy - corner - (dx, dy)), -1)
+            on = (x >= 0) & (y >= 0) & (x < canvas.size[1]) & (y < canvas.size[0])
+            np.add.at(image, (y[on], x[on]), weight[on])
+    return image.var()
+
+
+def test_the_same_seed_gives_the_same_events():
+    recording = simulate(SMALL)
+    first, second = (Events.join(list(recording.chunks())) for _ in range(2))
+    assert same(first, second)
+    texture.cache_clear()
+    assert same(first, Events.join(list(simulate(SMALL).chunks())))
+
+
+def test_another_seed_gives_other_events():
+    assert not same(events(SMALL), events(dataclasses.replace(SMALL, seed=1)))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_events_are_sorted_within_the_duration_and_on_the_sensor(scene):
+    options, e = SCENES[scene], events(SCENES[scene])
+    assert (e.t.dtype, e.x.dtype, e.y.dtype, e.p.dtype) == (np.int64, np.uint16, np.uint16, np.uint8)
+    assert (np.diff(e.t) >= 0).all()
+    assert e.t[0] >= 0
+    assert e.t[-1] <= options.duration * 1e6
+    assert e.x.max() == options.width - 1
+    assert e.y.max() == options.height - 1
+    assert e.p.max() == 1
+
+
+def test_polarities_are_balanced():
+    for options in SCENES.values():
+        assert 0.4 < events(options).p.mean() < 0.6
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_two_events_of_a_pixel_are_closer_than_the_refractory_time(scene):
+    e = events(SCENES[scene])
+    pixel = e.y.astype(int) * 240 + e.x
+    order = np.lexsort([e.t, pixel])
+    gap = np.diff(e.t[order])[np.diff(pixel[order]) == 0]
+    assert gap.min() >= 500
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_path_starts_at_the_identity_and_covers_the_duration(motion):
+    recording = simulate(Simulation(motion=motion, duration=0.2504))
+    truth = recording.truth
+    assert torch.equal(truth.pose.R[0], torch.eye(3, dtype=torch.float64))
+    assert torch.equal(truth.pose.t[0], torch.zeros(3, dtype=torch.float64))
+    assert truth.time[-1] == 251_000
+    assert (truth.time.diff() == 1000).all()
+    assert recording.plane.distance.item() == pytest.approx(0.8 * math.cos(math.hypot(8, 10) * math.pi / 180))
+    assert (recording.name, str(recording.path), recording.count) == (f"poster_{motion}", "simulated", None)
+
+
+@pytest.mark.parametrize("options", [*(Simulation(motion=m) for m in MOTIONS), Simulation("panorama", "rotation", speed=1.5)], ids=str)
+def test_velocity_agrees_with_differences_of_the_path(options):
+    time, h = torch.linspace(0.1, 5, 400, dtype=torch.float64), 1e-4
+    before, here, after = (pose(options, time + s) for s in (-h, 0, h))
+    omega = (so3.log(here.R.mT @ after.R) - so3.log(here.R.mT @ before.R)) / (2 * h)
+    speed = (here.R.mT @ (after.t - before.t)[..., None])[..., 0] / (2 * h)
+    motion = velocity(options, time)
+    torch.testing.assert_close(motion.omega, omega, rtol=1e-4, atol=1e-4 * omega.abs().max().item())
+    torch.testing.assert_close(motion.velocity, speed, rtol=1e-4, atol=1e-4 * speed.abs().max().item())
+
+
+def test_motion_is_as_fast_as_promised():
+    motion = velocity(Simulation(), torch.linspace(0, 10, 5000, dtype=torch.float64))
+    omega, speed = motion.omega.norm(dim=-1).rad2deg(), motion.velocity.norm(dim=-1)
+    assert 150 < omega.max() < 230
+    assert 0.9 < speed.max() < 1.3
+    assert omega.min() < 60
+
+
+def test_a_camera_that_stands_still_sees_noise_only():
+    e = events(Simulation(duration=0.3, speed=0.0, noise=4.0))
+    expected = 4 * 0.3 * 240 * 180
+    assert abs(len(e) - expected) < 5 * math.sqrt(expected)
+    assert abs(e.p.mean() - 0.5) < 5 * 0.5 / math.sqrt(expected)
+
+
+def test_half_the_threshold_gives_about_twice_the_events():
+    # with edges of several thresholds: where texture is fainter than that, as in the poster, it is three times
+    quiet = dataclasses.replace(SMALL, scene="shapes", noise=0.0, duration=0.1)
+    ratio = len(events(dataclasses.replace(quiet, threshold=0.125, mismatch=0.0175))) / len(events(quiet))
+    assert 1.6 < ratio < 2.6
+
+
+def test_no_noise_no_filter_no_blindness_no_mismatch_are_possible():
+    clean = dataclasses.replace(SMALL, noise=0.0, bandwidth=0.0, refractory=0.0, mismatch=0.0)
+    assert len(events(clean)) > 100
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_true_motion_is_the_sharpest(scene):
+    options, e = SCENES[scene], events(SCENES[scene])
+    windows = [e[i : i + 20_000] for i in range(0, len(e) - 19_999, 20_000)]
+    assert len(windows) >= 2
+    for window in windows:
+        true, still, less, more = (variance(options, window, s) for s in (1, 0, 0.9, 1.1))
+        print(f"{scene} {true / still:.3f} {true / less:.3f} {true / more:.3f}")
+        assert true > 1.15 * still
+        assert true > less
+        assert true > more
+
+
+def test_events_are_as_rich_as_those_of_the_shared_simulation(shared):
+    with h5py.File(shared / "data/sim/poster_6dof_sim/events.h5") as file:
+        there = len(file["events/t"]) / 6.0
+    assert 0.3 < len(events(SCENES["poster"])) / 0.12 / there < 3
+
+
+def test_the_panorama_has_no_seam():
+    light = texture("panorama", 0, 200.0)
+    latitude = torch.linspace(-1.57, 1.57, 3000)
+
+    def step(longitude):
+        across = [torch.tensor(longitude + s).deg2rad() for s in (-0.05, 0.05)]
+        left, right = (light.sample(torch.stack([latitude.cos() * a.sin(), latitude.sin(), latitude.cos() * a.cos()])) for a in across)
+        return (left - right).abs().mean()
+
+    inside = torch.stack([step(x) for x in (-160.0, -100.0, -20.0, 20.0, 70.0, 110.0)]).max()
+    for longitude in (180.0, -135.0, -45.0, 45.0, 135.0):  # the ends of a map, and the edges of the cube behind it
+        assert step(longitude) < 2 * inside
+    angle = torch.linspace(0, 2 * math.pi, 50)
+    for pole in (-1.0, 1.0):
+        near = light.sample(torch.stack([1e-4 * angle.cos(), torch.full_like(angle, pole), 1e-4 * angle.sin()]))
+        assert near.std() < 1e-3
+
+
+def test_a_picture_is_a_scene(tmp_path):
+    from PIL import Image
+
+    y, x = np.mgrid[:90, :120]
+    Image.fromarray((((x // 6 + y // 6) % 2) * 200).astype(np.uint8)).save(tmp_path / "board.png")
+    options = dataclasses.replace(SMALL, scene=str(tmp_path / "board.png"))
+    assert simulate(options).name == "board_6dof"
+    assert len(events(options)) > 100
+    (tmp_path / "none.png").write_text("no picture")
+    with pytest.raises(DataError, match="cannot be read as a picture"):
+        events(dataclasses.replace(SMALL, scene=str(tmp_path / "none.png")))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scene": "postre"}, "did you mean 'poster'"),
+        ({"motion": "5dof"}, "did you mean '6dof'"),
+        ({"scene": "panorama"}, "motion wants rotation"),
+        ({"duration": 0.0}, "duration wants a positive number, got 0"),
+        ({"distance": math.nan}, "distance wants a positive"),
+        ({"noise": -1.0}, "noise wants a number of at least 0"),
+        ({"tilt": (80.0, 0.0)}, "tilt wants two angles"),
+        ({"width": 2}, "got 2 x 180"),
+        ({"distortion": (0.1, 0.2)}, "plumb_bob wants 5"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        Simulation(**options)
+
+
+def test_a_view_past_the_horizon_is_refused():
+    with pytest.raises(ValueError, match="looks past the plane's horizon"):
+        simulate(Simulation(tilt=(50.0, 0.0)))
+    with pytest.raises(ValueError, match=r"at 0\.\d+ s the camera"):
+        simulate(Simulation(distance=0.1))
+
+
+def test_written_files_are_the_recording(tmp_path):
+    told = []
+    folder = write(SMALL, tmp_path / "new" / "small", told.append)
+    assert sorted(p.name for p in folder.iterdir()) == sorted(
+        ["README.md", "calib.txt", "events.h5", "groundtruth.txt", "plane.txt", "texture.png", "velocity.txt"]
+    )
+    assert told == sorted(told)
+    assert told[-1] == pytest.approx(SMALL.duration, abs=2e-3)
+    back, recording = opening.open(folder), simulate(SMALL)
+    assert same(Events.join(list(back.chunks())), events(SMALL))
+    assert back.camera == recording.camera
+    torch.testing.assert_close(back.truth.pose.R, recording.truth.pose.R, rtol=0, atol=1e-9)
+    torch.testing.assert_close(back.plane.normal, recording.plane.normal)
+    table = np.loadtxt(folder / "velocity.txt")
+    motion = velocity(SMALL, torch.from_numpy(table[:, 0]))
+    np.testing.assert_allclose(table[:, 1:], torch.cat([motion.velocity, motion.omega], -1), atol=1e-8)
+    assert "* threshold: 0.25" in (folder / "README.md").read_text()
+
+
+def test_only_our_own_folder_is_replaced(tmp_path):
+    folder = write(SMALL, tmp_path / "small")
+    write(dataclasses.replace(SMALL, seed=3), folder)
+    assert "* seed: 3" in (folder / "README.md").read_text()
+    (folder / "thesis.txt").write_text("mine")
+    with pytest.raises(DataError, match="was not written by the simulator"):
+        write(SMALL, folder)
+    assert (folder / "thesis.txt").read_text() == "mine"
+    assert [p.name for p in tmp_path.iterdir()] == ["small"]
+
+
+def test_a_place_that_cannot_be_written_is_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot be written"):
+        write(SMALL, tmp_path / "file" / "small")
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limits[1]))
+    try:
+        with pytest.raises(DataError, match="cannot be written"):
+            write(SMALL, tmp_path / "small")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,157 @@
+"""The command line: torchcmax simulate | info | compensate.  Exits 0 when all went well, 1 on bad data, 2 on wrong usage."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+import yaml
+from jsonargparse import Namespace
+from tqdm import tqdm
+
+from torchcmax import __version__
+from torchcmax.compensate import Compensation, compensate
+from torchcmax.config import USAGE_ERROR, Parser, command, parser
+from torchcmax.io import DataError, DataWarning, OpenOptions, Recording, open, summary
+from torchcmax.report import Report
+from torchcmax.simulator import Simulation, write
+
+T = TypeVar("T")
+DESCRIPTION = """Motion from event cameras by contrast maximization: warp the events of a window with a candidate motion, vote them
+into an image; the right motion is the one that makes the image sharpest."""
+RECORDING_HELP = "folder with events.txt or events.h5 and calib.txt, the same as a .zip, or an HDF5 file"
+
+
+def build() -> Parser:
+    """The whole command line."""
+    main = parser("torchcmax", DESCRIPTION)
+    main.add_argument("--version", action="version", version=__version__)
+    commands = main.add_subcommands(required=True, dest="command")
+
+    simulate = command("Write a simulated recording with exact ground truth: a camera moves before a textured plane or in a panorama.")
+    simulate.add_argument("--out", type=str, required=True, help="folder to write: events.h5, calib.txt, groundtruth.txt, ...")
+    simulate.add_class_arguments(Simulation)
+    commands.add_subcommand("simulate", simulate, help="write a simulated recording with exact ground truth")
+
+    info = command("Say what is in a recording: sensor, calibration, duration, counts, rate over time, gaps, problems found.")
+    info.add_argument("--json", action="store_true", help="print JSON instead of text")
+    _add_opening(info)
+    commands.add_subcommand("info", info, help="say what is in a recording, and what is wrong with it")
+
+    compensating = command(
+        "Estimate the motion of every window of a recording and draw its events before and after compensation. Writes windows.csv "
+        "(motion at each window's first event, rad/s and plane distances/s), images/, summary.json and TensorBoard curves to --out."
+    )
+    _add_opening(compensating)
+    compensating.add_argument("--out", type=str, required=True, help="folder to write; look at it with: tensorboard --logdir DIR")
+    compensating.add_argument("--images", type=int, default=10, help="a picture of every so many windows; 0: none")
+    compensating.add_argument("--quiet", action="store_true", help="no progress bar")
+    compensating.add_class_arguments(Compensation)
+    commands.add_subcommand("compensate", compensating, help="estimate the motion of every window, and show it")
+    return main
+
+
+def _add_opening(command: Parser) -> None:
+    command.add_argument("recording", type=str, help=RECORDING_HELP)
+    command.add_argument("--strict", action="store_true", help="refuse what would be mended: events out of order, or at equal times")
+    command.add_class_arguments(OpenOptions, skip={"strict", "chunk"})
+
+
+def _dataclass(kind: type[T], config: Namespace) -> T:
+    """The part of the parsed options that belongs to one dataclass."""
+    names = {f.name for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: value for name, value in vars(config).items() if name in names})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; the exit status is returned."""
+    torch.set_num_threads(1)  # one window at a time is too little work for two: they would spin
+    warnings.showwarning = _say
+    top = build()
+    config = top.parse_args(arguments)
+    chosen = top.instantiate(config)[config.command]
+    try:
+        return {"simulate": run_simulate, "info": run_info, "compensate": run_compensate}[config.command](chosen)
+    except ValueError as error:  # an option that a dataclass refuses
+        print(f"torchcmax {config.command}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except DataError as error:
+        print(f"torchcmax {config.command}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"\ntorchcmax {config.command}: stopped; what was finished is kept", file=sys.stderr)
+        return 130
+
+
+def _say(message: Warning | str, category: type[Warning], *place: Any) -> None:
+    if issubclass(category, DataWarning):
+        print(f"warning: {message}", file=sys.stderr)
+
+
+def run_simulate(config: Namespace) -> int:
+    """torchcmax simulate"""
+    options = _dataclass(Simulation, config)
+    with tqdm(
+        total=options.duration, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}]"
+    ) as bar:
+        write(options, Path(config.out), lambda done: bar.update(min(done, options.duration) - bar.n))
+    print(f"recording: {config.out}")
+    return 0
+
+
+def run_info(config: Namespace) -> int:
+    """torchcmax info"""
+    found = summary(open(config.recording, _dataclass(OpenOptions, config)))
+    print(json.dumps(dataclasses.asdict(found), indent=1) if config.json else found)
+    return 0
+
+
+def run_compensate(config: Namespace) -> int:
+    """torchcmax compensate"""
+    options, opening = _dataclass(Compensation, config), _dataclass(OpenOptions, config)
+    check_device(options.device)
+    recording = open(config.recording, opening)
+    settings = {"recording": config.recording, **dataclasses.asdict(opening), **dataclasses.asdict(options)}
+    settings.pop("chunk")
+    text = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
+    with (
+        Report(Path(config.out), recording, options, text, config.images) as report,
+        tqdm(total=expected(recording, options), unit="window", desc=recording.name, disable=config.quiet) as bar,
+    ):
+        for window, estimate in compensate(recording, options):
+            report.add(window, estimate)
+            bar.update(len(window))
+    found = report.summary()
+    print(
+        f"{found['windows']} windows, median gain {found['gain_median']:.4f}, {found['mega_events_per_second']:.2f} Mev/s\n"
+        f"motions: {report.folder / 'windows.csv'}\npictures: {report.folder / 'images'} ({found['pictures']})\n"
+        f"curves: tensorboard --logdir {report.folder}"
+    )
+    return 0
+
+
+def check_device(name: str) -> None:
+    """A device that isn't there is the user's error, said before any work."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"--device wants cpu, cuda or cuda:N, got {name!r}") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: this machine has no CUDA device that torch can use; take --device cpu")
+
+
+def expected(recording: Recording, options: Compensation) -> int | None:
+    """How many windows there will be, if that is known."""
+    if recording.count is None:
+        return options.limit
+    windows = max(0, (recording.count - options.events) // (options.stride or options.events) + 1)
+    return windows if options.limit is None else min(windows, options.limit)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""Motion-compensate a recording: its windows in batches, each estimated from a cold start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchcmax.core.estimate import Estimate, Search, estimate
+from torchcmax.core.model import Model, Planar, PlanarKnown, Rotation, Translation
+from torchcmax.core.objective import Look
+from torchcmax.core.window import Window
+from torchcmax.io import DataError, Recording
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """What is estimated, from how many events, and where."""
+
+    model: Literal["rotation", "translation", "planar"] = "rotation"
+    """rotation: 3 numbers, any scene; translation: 3, before a plane; planar: 6 before a known plane, 8 with its normal."""
+    plane: str = "auto"
+    """The plane: wall (fronto-parallel), truth (the recording's plane and poses), three numbers "nx,ny,nz" of its normal in the
+    camera's frame, or free (estimated, for planar only); auto: free for planar, wall for translation."""
+    events: int = 30000
+    """Events in a window."""
+    stride: int | None = None
+    """Events from the start of one window to the next; default: the windows lie end to end."""
+    limit: int | None = None
+    """Stop after this many windows."""
+    batch: int = 16
+    """Windows computed together; memory grows with it."""
+    device: str = "cpu"
+    """cpu, cuda, or cuda:1 and so on."""
+    look: Look = field(default_factory=Look)
+    """How a window is looked at."""
+    search: Search = field(default_factory=Search)
+    """How the sharpest image is searched for."""
+
+    def __post_init__(self) -> None:
+        for name in ("events", "stride", "limit", "batch"):
+            value, least = getattr(self, name), 2 if name == "events" else 1
+            if value is not None and value < least:
+                raise ValueError(f"{name} wants a number of at least {least}, got {value}")
+        given_normal(self.plane)
+        if self.model == "translation" and self.plane == "free":
+            raise ValueError("--plane free goes with --model planar: a translation alone hardly tells the plane from the velocity")
+
+
+def given_normal(plane: str) -> tuple[float, ...] | None:
+    """The unit normal that an option like "0,0.1,-1" names, turned to the camera; None for the words."""
+    if plane in ("auto", "wall", "truth", "free"):
+        return None
+    try:
+        x, y, z = (float(part) for part in plane.replace(",", " ").split())
+    except ValueError:
+        raise ValueError(f"--plane wants auto, free, wall, truth or three numbers nx,ny,nz, got {plane!r}") from None
+    length = (x * x + y * y + z * z) ** 0.5
+    if not 0 < length < float("inf"):
+        raise ValueError(f"--plane wants a normal with a length, got {plane!r}")
+    side = -length if z > 0 else length
+    return (x / side, y / side, z / side)
+
+
+def compensate(recording: Recording, options: Compensation | None = None) -> Iterator[tuple[Window, Estimate]]:
+    """Windows and what they show, batch by batch, in the order of the recording.
+
+    -> Window [B, N] and Estimate [B], float32 on the options' device.  Memory is that of one batch.
+    """
+    options = options or Compensation()
+    left = options.limit
+    batch = options.batch if left is None else min(left, options.batch)
+    for window in recording.windows(options.events, options.stride, batch):
+        window = window[:left].to(options.device, torch.float32)
+        yield window, estimate(window, recording.camera, motion_model(options, recording, window), options.look, options.search)
+        left = None if left is None else left - len(window)
+        if left == 0:
+            return
+
+
+def motion_model(options: Compensation, recording: Recording, window: Window) -> Model:
+    """The model that the options name, with the planes it knows of these windows."""
+    focal = (recording.camera.fx * recording.camera.fy) ** 0.5
+    if options.model == "rotation":
+        return Rotation(focal)
+    if options.model == "planar" and options.plane in ("auto", "free"):
+        return Planar(focal)
+    kind = Translation if options.model == "translation" else PlanarKnown
+    given = given_normal(options.plane)
+    if given is not None:
+        return kind(focal, torch.tensor(given).expand(len(window), 3))
+    return kind(focal, true_normal(recording, window.start) if options.plane == "truth" else None)
+
+
+def true_normal(recording: Recording, start: Tensor) -> Tensor:
+    """The recording's plane as the camera sees it at the given times: start [B] µs -> normal [B, 3]."""
+    if recording.truth is None or recording.plane is None:
+        remedy = "give groundtruth.txt and plane.txt, or another --plane"
+        raise DataError(recording.path, "has no ground truth and plane for --plane truth", remedy)
+    try:
+        pose = recording.truth.at(start.cpu())
+    except ValueError as error:
+        raise DataError(recording.path, f"the ground truth ends before the events do: {error}", "take another --plane") from None
+    return recording.plane.seen_from(pose).normal

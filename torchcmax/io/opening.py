@@ -1,0 +1,124 @@
+"""open: what a path holds, and the recording in it."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import h5py
+
+from torchcmax.core.camera import Camera
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Trajectory
+from torchcmax.io.calibration import ECD_FORM, Lens, guess_sensor, pinhole, read_lens
+from torchcmax.io.checked import Source, checked
+from torchcmax.io.errors import DataError
+from torchcmax.io.hdf5 import Contents, read_contents, read_events
+from torchcmax.io.member import Member, image_size, open_zip, reading
+from torchcmax.io.recording import Events, Recording
+from torchcmax.io.text import check_end, line_of, read_text
+from torchcmax.io.trajectory import read_plane, read_trajectory
+
+WANTED = "give a folder with events.txt (lines t x y p) or events.h5, and calib.txt; the same as a .zip; or an HDF5 file"
+
+
+@dataclass(frozen=True)
+class OpenOptions:
+    """How a recording is opened."""
+
+    strict: bool = False  # refuse what would be mended: events out of order, or at equal times
+    camera: str = ""  # calibration file instead of the recording's own: ECD form, YAML, or the word pinhole
+    sensor: tuple[int, int] | None = None  # width, height px, instead of what the recording says
+    chunk: int = 1 << 20  # events read at a time, and how many places an event out of order can be moved
+
+
+def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
+    """The recording at a path: a folder with events.txt or events.h5, a .zip of the first, or an HDF5 file.
+
+    Files are known by what is in them, not by their endings.  Events are read when they are asked for.  Only where neither the
+    options, the files nor the first picture in images/ tell the sensor's size, all events are read once to find it (`guess_sensor`).
+    """
+    path, options = Path(path), options or OpenOptions()
+    if options.chunk < 1:
+        raise ValueError(f"a chunk wants at least 1 event, got {options.chunk}")
+    with reading(path):
+        if path.is_dir():
+            return _folder(path, options)
+        if not path.is_file():
+            raise DataError(path, "there is no such file or folder", "check the name; " + WANTED)
+        with path.open("rb") as stream:
+            head = stream.read(4096)
+    if not head:
+        raise DataError(path, "is empty", WANTED)
+    if h5py.is_hdf5(path):
+        return _hdf5(path, options)
+    if head.startswith(b"PK") or zipfile.is_zipfile(path):
+        return _text(open_zip(path), path, path.stem, options)
+    if path.suffix == ".txt" or _like_events(head):
+        return _text(path.parent, path, path.parent.resolve().name, options, path.name)
+    kind = "should be an HDF5 file and is none" if path.suffix in (".h5", ".hdf5") else "is not a recording"
+    raise DataError(path, f"{kind}: it begins with {head[:16]!r}", WANTED)
+
+
+def _like_events(head: bytes) -> bool:
+    """Whether the first line that is no comment has four columns, the first a number."""
+    lines = [line.split() for line in head.split(b"\n") if line.strip() and not line.startswith(b"#")]
+    return bool(lines) and len(lines[0]) == 4 and lines[0][0].replace(b".", b"").isdigit()
+
+
+def _folder(folder: Path, options: OpenOptions) -> Recording:
+    if (folder / "events.h5").is_file():
+        return _hdf5(folder / "events.h5", options)
+    if (folder / "events.txt").is_file():
+        return _text(folder, folder / "events.txt", folder.resolve().name, options)
+    names = sorted(entry.name for entry in folder.iterdir())
+    found = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    raise DataError(folder, f"is a folder without a recording; it holds {found or 'nothing'}", WANTED)
+
+
+def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: str = "events.txt") -> Recording:
+    """A recording as text, in a folder or a .zip."""
+    file = folder / events
+    check_end(file)
+    raw = partial(read_text, file, options.chunk)
+    camera = _camera(folder, Contents(None, sensor=image_size(folder)), str(file), options, raw)
+    source = Source(str(file), camera.size[::-1], partial(line_of, file), options.strict)
+    return Recording(path, name, camera, lambda: checked(raw(), source), None, *_truth(folder))
+
+
+def _hdf5(path: Path, options: OpenOptions) -> Recording:
+    """A recording in an HDF5 file.  The files beside it go before what stands in it, but for our own layout, which is complete."""
+    contents = read_contents(path)
+    raw = partial(read_events, path, options.chunk)
+    folder = None if contents.own else path.parent
+    camera = _camera(folder, contents, str(path), options, raw)
+    truth, plane = (None, None) if folder is None else _truth(folder)
+    name = contents.name or (path.parent.resolve().name if path.stem == "events" else path.stem)
+    source = Source(str(path), camera.size[::-1], lambda event: f"event {event + 1}", options.strict)
+    return Recording(path, name, camera, lambda: checked(raw(), source), contents.count, truth or contents.truth, plane or contents.plane)
+
+
+def _camera(folder: Member | None, contents: Contents, file: str, options: OpenOptions, raw: Callable[[], Iterator[Events]]) -> Camera:
+    """The camera: its lens from the options, calib.txt or the file; its size from the options, the lens's file, the file, or the events."""
+    lens: Lens | None = None
+    if options.camera and options.camera != "pinhole":
+        lens = read_lens(Path(options.camera))
+    elif not options.camera and folder is not None and (folder / "calib.txt").is_file():
+        lens = read_lens(folder / "calib.txt")
+    elif not options.camera:
+        lens = contents.lens
+        if lens is None:
+            remedy = f"put {ECD_FORM} into a file calib.txt beside the events, give --camera FILE, or --camera pinhole [--sensor W H]"
+            raise DataError(file, "there is no calibration for it", remedy)
+    known = options.sensor or (lens and lens.sensor) or contents.sensor
+    sensor = known or guess_sensor(file, lens, raw)
+    return pinhole(file, sensor) if lens is None else lens.camera(sensor)
+
+
+def _truth(folder: Member) -> tuple[Trajectory | None, Plane | None]:
+    """Ground truth and plane from the files beside the events, where they are."""
+    poses, plane = folder / "groundtruth.txt", folder / "plane.txt"
+    return read_trajectory(poses) if poses.is_file() else None, read_plane(plane) if plane.is_file() else None

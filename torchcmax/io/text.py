@@ -1,0 +1,174 @@
+"""Events from text: lines `t x y p`, that is seconds, column, row, 1 (brighter) or 0 or -1 (darker)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import IO
+
+import numpy as np
+
+from torchcmax.io.errors import DataError
+from torchcmax.io.member import Member, reading, size_in_bytes
+from torchcmax.io.recording import Events
+
+BLOCK = 1 << 20  # bytes taken apart at a time: fits the processor's cache
+LONGEST = 1 << 16  # bytes of a line; more is no text of events
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+BETWEEN = np.frombuffer(b".   \n", np.uint8)  # what stands between the digits of a line: 1.234567 12 34 1
+MOST = (12, 5, 5, 1)  # digits of whole seconds, column, row, polarity
+SPELLINGS = ((b"\r\n", b"\n"), (b"\t", b" "), (b" -1\n", b" 0\n"))
+
+
+def check_end(file: Member) -> None:
+    """Finds a last line that is cut off, before anything is computed.  A member of a .zip is unpacked once for that."""
+    size = size_in_bytes(file)
+    if not size:
+        raise DataError(str(file), "is empty", "record or copy it again")
+    with reading(file), file.open("rb") as stream:
+        stream.seek(max(size - LONGEST, 0))
+        last = stream.read().rsplit(b"\n", 1)[-1]
+    if last.strip() and not last.lstrip().startswith(b"#") and len(last.split()) < 4:
+        with reading(file), file.open("rb") as stream:
+            number = sum(block.count(b"\n") for block in _blocks(stream, BLOCK, file))
+        cut = _quoted(last.decode("ascii", "backslashreplace"))
+        remedy = f"the file was not copied or written to its end; copy it again, or drop the line: sed -i '$d' {file}"
+        raise DataError(str(file), f"the last line is cut off: {cut}", remedy, f"line {number}")
+
+
+def read_text(file: Member, chunk: int, block: int = BLOCK) -> Iterator[Events]:
+    """Events as they stand in the file, `chunk` at a time; fewer only at the end.  `block`: bytes taken apart at a time."""
+    parts: list[Events] = []
+    count, line = 0, 1
+    with reading(file), file.open("rb") as stream:
+        for text in _blocks(stream, block, file):
+            events, lines = _parse(text, line, file)
+            parts.append(events)
+            count, line = count + len(events), line + lines
+            if count >= chunk:
+                whole = Events.join(parts)
+                for start in range(0, count - chunk + 1, chunk):
+                    yield whole[start : start + chunk]
+                parts, count = [whole[count - count % chunk :]], count % chunk
+    if count:
+        yield Events.join(parts)
+
+
+def line_of(file: Member, event: int) -> str:
+    """Where an event, counted from 0, stands in the file; reads it again up to there."""
+    with reading(file), file.open("rb") as stream:
+        rows = (row for text in _blocks(stream, BLOCK, file) for row in text.split(b"\n")[:-1])
+        for number, row in enumerate(rows, 1):
+            if row.strip() and not row.lstrip().startswith(b"#"):
+                event -= 1
+            if event < 0:
+                return f"line {number}"
+    return "at its end"
+
+
+def _blocks(stream: IO[bytes], size: int, file: Member) -> Iterator[bytes]:
+    """Whole lines, about `size` bytes of them."""
+    passed, rest = 0, b""
+    while piece := stream.read(size):
+        cut = piece.rfind(b"\n") + 1
+        if len(rest) + (piece.find(b"\n") if cut else len(piece)) > LONGEST:
+            raise DataError(str(file), f"a line of more than {LONGEST} bytes: no text of events", "lines are t x y p", f"byte {passed + 1}")
+        if cut:
+            yield rest + piece[:cut]
+            passed, rest = passed + len(rest) + cut, piece[cut:]
+        else:
+            rest += piece
+    if rest:
+        yield rest + b"\n"
+
+
+def _parse(text: bytes, line: int, file: Member) -> tuple[Events, int]:
+    """A block of lines as events, and the number of lines: the quick way where every line is plain, else line by line."""
+    events = _plain(text)
+    if events is not None:
+        return events, len(events)
+    for spelling, plain in SPELLINGS:
+        text = text.replace(spelling, plain)
+    events = _plain(text)
+    return _by_line(text, line, file) if events is None else events, text.count(b"\n")
+
+
+def _plain(text: bytes) -> Events | None:
+    """Lines of digits like `1.234567 12 34 1`, all at once, twice as fast as np.loadtxt; None where one line is of another form."""
+    digit = np.frombuffer(text, np.uint8) - np.uint8(48)
+    other = np.flatnonzero(digit > 9).astype(np.int32)
+    if len(other) % 5 or (digit[other].reshape(-1, 5) != BETWEEN - np.uint8(48)).any():
+        return None
+    dot, *end = other.reshape(-1, 5).T.copy()
+    first = np.concatenate([np.zeros(1, np.int32), end[3][:-1] + np.int32(1)])
+    starts = [first, *(before + np.int32(1) for before in end[:3])]
+    widths = [stop - start for start, stop in zip(starts, [dot, *end[1:]], strict=True)]
+    if any(width.min() < 1 for width in [*widths, end[0] - dot - 1]) or any(w.max() > most for w, most in zip(widths, MOST, strict=True)):
+        return None
+    x, y, p = (_whole(digit, width, stop, np.int32) for width, stop in zip(widths[1:], end[1:], strict=True))
+    if max(x.max(), y.max()) > 65535 or p.max() > 1:
+        return None
+    t = _whole(digit, widths[0], dot, np.int64) * 1_000_000 + _millionths(digit, dot, end[0])
+    return Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
+
+
+def _whole(digit: np.ndarray, width: np.ndarray, end: np.ndarray, dtype: type[np.signedinteger]) -> np.ndarray:
+    """Numbers of `width` digits that end before `end`, from the last digit to the first."""
+    value: np.ndarray = digit[end - 1].astype(dtype)
+    least = width.min()
+    for k in range(1, int(width.max())):
+        place = digit.take(end - 1 - k, mode="clip")
+        value += (place * (k < width) if k >= least else place) * dtype(10**k)
+    return value
+
+
+def _millionths(digit: np.ndarray, dot: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The six digits behind the dot, rounded by the seventh: exact, however large the number before the dot."""
+    width = end - dot - 1
+    least = width.min()
+    value = np.zeros(len(dot), np.int32)
+    for k in range(1, 8):
+        place = digit.take(dot + k, mode="clip")
+        place = place * (k <= width) if k > least else place
+        value = value * np.int32(10) + place if k < 7 else value + (place >= 5)
+    return value
+
+
+def _by_line(text: bytes, line: int, file: Member) -> Events:
+    """Events line by line, from line number `line` on, with comments, exponents, minus signs; the first line that is wrong is named."""
+    rows = []
+    for number, raw in enumerate(text.decode("ascii", "backslashreplace").split("\n"), line):
+        row = raw.strip()
+        if row and not row.startswith("#"):
+            try:
+                rows.append(_row(row))
+            except ValueError as error:
+                remedy = f"a line is t x y p: seconds, column, row, 0 or 1; to drop this one: sed -i '{number}d' {file}"
+                raise DataError(str(file), f"{error}: {_quoted(row)}", remedy, f"line {number}") from error
+    t, x, y, p = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Events(np.array(t, np.int64), np.array(x, np.uint16), np.array(y, np.uint16), np.array(p, np.uint8))
+
+
+def _row(row: str) -> tuple[int, int, int, int]:
+    """One event, t in µs; ValueError says what is wrong."""
+    columns = row.split()
+    if len(columns) != 4:
+        raise ValueError(f"{len(columns)} columns instead of 4")
+    for column in columns:
+        if column.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+            raise ValueError(f"{column} is no measurement")
+        if not NUMBER.fullmatch(column):
+            raise ValueError(f"{_quoted(column)} is not a number")
+    t, x, y, p = map(float, columns)
+    if not abs(t) < 9e12:
+        raise ValueError(f"{columns[0]} is no time in seconds")
+    if not (x.is_integer() and y.is_integer() and 0 <= x <= 65535 and 0 <= y <= 65535):
+        raise ValueError(f"({columns[1]}, {columns[2]}) is no pixel")
+    if p not in (-1, 0, 1):
+        raise ValueError(f"polarity {columns[3]} is neither 0 nor 1")
+    return round(t * 1e6), int(x), int(y), int(p > 0)
+
+
+def _quoted(text: str) -> str:
+    """Offending text, not all of it where it is long."""
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,209 @@
+"""What a run leaves in its folder: windows.csv, pictures before | after, summary.json, TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from torchcmax import __version__
+from torchcmax.board import Board
+from torchcmax.compensate import Compensation
+from torchcmax.core.camera import Canvas
+from torchcmax.core.draw import Ink, draw
+from torchcmax.core.estimate import Estimate
+from torchcmax.core.objective import REFERENCES
+from torchcmax.core.window import Window
+from torchcmax.io import DataError, Recording
+
+COLUMNS = (
+    "index start_us end_us events contrast_zero contrast gain omega_x omega_y omega_z v_x v_y v_z n_x n_y n_z evaluations converged"
+).split()
+SUMMARY = "summary.json"
+CURVES = 5  # windows whose optimizer is shown evaluation by evaluation, of those that are pictured
+BRIGHT = 0.995  # quantile of the pixels hit that is drawn in full colour
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """A temporary name to write to, renamed to `path` at the end; removed when something goes wrong."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise DataError(path, f"cannot be written: {error.strerror}", "free some space, or give another --out") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def rows(window: Window, estimate: Estimate, first: int) -> list[dict[str, float]]:
+    """One line of windows.csv for each window, in COLUMNS; nan where the model has no such number."""
+    normal = torch.full_like(estimate.motion.omega, torch.nan) if estimate.normal is None else estimate.normal
+    table = torch.cat(
+        [
+            torch.arange(first, first + len(window))[:, None],
+            window.start.cpu()[:, None],
+            (window.start + (window.duration.double() * 1e6).round().long()).cpu()[:, None],
+            window.weight.sum(-1, keepdim=True).cpu(),
+            *(v[:, None].cpu() for v in (estimate.contrast_zero, estimate.contrast, estimate.gain)),
+            *(v.cpu() for v in (estimate.motion.omega, estimate.motion.velocity, normal)),
+            *(v[:, None].cpu() for v in (estimate.evaluations, estimate.converged)),
+        ],
+        1,
+    )
+    return [dict(zip(COLUMNS, line, strict=True)) for line in table.double().tolist()]
+
+
+def pictures(window: Window, estimate: Estimate, canvas: Canvas, reference: float) -> np.ndarray:
+    """Each window before | after: brighter (ON) events red, darker (OFF) blue, as many shades for both sides: -> [B, H, 2 W, 3] uint8."""
+    owner = torch.arange(len(window), device=window.ray.device)
+    still = torch.zeros_like(estimate.H_k)
+    still[:, 0] = torch.eye(3).to(still)
+    basis = Ink.of(window, reference).basis
+    on, off = (
+        torch.cat([draw(H, Ink(basis, (sign * window.polarity).clamp_min(0)), canvas, owner) for H in (still, estimate.H_k)], -1)
+        for sign in (1, -1)
+    )
+    return np.stack([coloured(a, b) for a, b in zip(on.cpu(), off.cpu(), strict=True)])
+
+
+def coloured(on: Tensor, off: Tensor) -> np.ndarray:
+    """Two images [H, W] on white paper: -> [H, W, 3] uint8."""
+    hit = (on + off)[on + off > 0.5]
+    full = hit.quantile(BRIGHT).clamp_min(1) if len(hit) else on.new_tensor(1.0)
+    on, off = (on / full).clamp(0, 1).sqrt(), (off / full).clamp(0, 1).sqrt()  # sqrt: single events stay visible
+    paper = torch.stack([1 - off, (1 - on - off).clamp_min(0), 1 - on], -1)
+    picture: np.ndarray = (255 * paper).byte().numpy()
+    return picture
+
+
+def captioned(picture: np.ndarray, text: str) -> np.ndarray:
+    """The picture [H, W, 3] with a line of text above it and a line down the middle."""
+    font = ImageFont.load_default(14)
+    page = Image.new("RGB", (picture.shape[1], picture.shape[0] + 22), "white")
+    page.paste(Image.fromarray(picture), (0, 22))
+    pen = ImageDraw.Draw(page)
+    pen.text((4, 3), text, fill="black", font=font)
+    pen.line([(picture.shape[1] // 2, 22), (picture.shape[1] // 2, page.height)], fill="gray")
+    return np.asarray(page)
+
+
+class Report:
+    """The folder of one run.  What is done stays, and is said to be incomplete, when the run ends before its time."""
+
+    def __init__(self, folder: Path, recording: Recording, options: Compensation, config: str, every: int) -> None:
+        """every: a picture of each every-th window; 0: none."""
+        self.folder, self.recording, self.options, self.every = folder, recording, options, every
+        self.canvas = Canvas.around(recording.camera, options.search.margin)
+        self.table: list[dict[str, float]] = []
+        self.pictured = 0
+        self.began = time.perf_counter()
+        self.config = config
+        try:
+            clear(folder)
+            (folder / "images").mkdir(parents=True, exist_ok=True)
+            self._csv = (folder / ".windows.csv.part").open("w", newline="")
+        except OSError as error:
+            raise DataError(folder, f"cannot be written to: {error.strerror}", "give another --out") from error
+        self._lines = csv.writer(self._csv)
+        self._lines.writerow(COLUMNS)
+        self.board = Board(folder)
+        self.board.config(config)
+
+    def add(self, window: Window, estimate: Estimate) -> None:
+        """A batch of windows, in the order of the recording."""
+        lines = rows(window, estimate, len(self.table))
+        try:
+            self._write(lines)
+            self._draw(window, estimate, lines)
+        except OSError as error:
+            raise DataError(
+                self.folder, f"cannot be written to: {error.strerror}", "free some space; what was done before is kept"
+            ) from error
+        self.table += lines
+
+    def _write(self, lines: list[dict[str, float]]) -> None:
+        whole = {"index", "start_us", "end_us", "events", "evaluations", "converged"}
+        for line in lines:
+            values = (f"{v:.0f}" if k in whole else "" if v != v else f"{v:.9g}" for k, v in line.items())
+            self._lines.writerow(values)
+            seconds = (line["end_us"] - line["start_us"]) * 1e-6
+            shown = {f"window/{k}": v for k, v in line.items() if k not in ("index", "start_us", "end_us", "events") and v == v}
+            shown["window/events_per_second"] = line["events"] / seconds if seconds > 0 else float("nan")
+            self.board.scalars(shown, int(line["index"]))
+        self._csv.flush()
+
+    def _draw(self, window: Window, estimate: Estimate, lines: list[dict[str, float]]) -> None:
+        chosen = [i for i, line in enumerate(lines) if self.every and line["index"] % self.every == 0]
+        if not chosen:
+            return
+        index = torch.tensor(chosen, device=window.ray.device)
+        drawn = pictures(window[index], estimate[index], self.canvas, REFERENCES[self.options.look.reference])
+        for i, picture in zip(chosen, drawn, strict=True):
+            line, number = lines[i], int(lines[i]["index"])
+            seconds = (line["end_us"] - line["start_us"]) * 1e-6
+            text = f"window {number}: {line['events']:.0f} events in {1e3 * seconds:.1f} ms, gain {line['gain']:.3f}; at rest | compensated"
+            page = captioned(picture, text)
+            with writing(self.folder / "images" / f"window_{number:05d}.png") as name:
+                Image.fromarray(page).save(name, format="PNG")
+            self.board.image("before_after", page, number)
+            if self.pictured < CURVES:
+                for blur, trace in zip(self.options.search.blur, estimate.traces, strict=True):
+                    self.board.curve(f"optimizer/window_{number:05d}/blur_{blur:g}_px", trace[i])
+            self.pictured += 1
+
+    def __enter__(self) -> Report:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._csv.close()
+        self.board.close()
+        (self.folder / ".windows.csv.part").replace(self.folder / "windows.csv")
+        with writing(self.folder / SUMMARY) as name:
+            name.write_text(json.dumps(self.summary(None if kind is None else f"{kind.__name__}: {error}"), indent=1) + "\n")
+
+    def summary(self, stopped: str | None = None) -> dict[str, object]:
+        """The run in numbers."""
+        wall = time.perf_counter() - self.began
+        events = sum(line["events"] for line in self.table)
+
+        def median(name: str) -> float | None:
+            return float(np.median([line[name] for line in self.table])) if self.table else None
+
+        return {
+            "complete": stopped is None,
+            "stopped_by": stopped,
+            "recording": self.recording.name,
+            "model": self.options.model,
+            "windows": len(self.table),
+            "events": int(events),
+            "seconds": (self.table[-1]["end_us"] - self.table[0]["start_us"]) * 1e-6 if self.table else 0.0,
+            "contrast_median": median("contrast"),
+            "gain_median": median("gain"),
+            "evaluations_median": median("evaluations"),
+            "converged_share": float(np.mean([line["converged"] for line in self.table])) if self.table else None,
+            "pictures": self.pictured,
+            "wall_seconds": round(wall, 3),
+            "mega_events_per_second": round(events / wall * 1e-6, 4),
+            "config": self.config,
+            "versions": {"torchcmax": __version__, "torch": torch.__version__, "python": platform.python_version()},
+        }
+
+
+def clear(folder: Path) -> None:
+    """Remove what an earlier run of ours left in the folder, and nothing else, so that old and new do not mix."""
+    if not (folder / SUMMARY).is_file():
+        return
+    for old in (*folder.glob("events.out.tfevents.*"), *(folder / "images").glob("window_*.png"), folder / "windows.csv", folder / SUMMARY):
+        old.unlink(missing_ok=True)
