@@ -49,7 +49,9 @@ def figure_2_3(recording: Recording, events: int, places: int) -> tuple[dict[str
     true_contrast = THESIS.sharpness(model.homography(x_true, torch.arange(len(window)), 0.0), ink, canvas, torch.arange(len(window)), 0.0)
     contrast, wrong = (-found.value).exp(), model.displacement(found.x, owner)
     angle = (wrong.normal * truth.normal[owner]).sum(-1).clamp(-1, 1).arccos().rad2deg()
-    in_view = (wrong.normal @ recording.camera.rays()[:: recording.camera.size[0] - 1, :: recording.camera.size[1] - 1].flatten(0, 1).mT.float()).amax(-1) < 0
+    in_view = (
+        wrong.normal @ recording.camera.rays()[:: recording.camera.size[0] - 1, :: recording.camera.size[1] - 1].flatten(0, 1).mT.float()
+    ).amax(-1) < 0
     angle = torch.where((contrast >= true_contrast[owner]) & in_view, angle, -1.0)
     row = int(angle.argmax())
     if angle[row] < 5:
@@ -102,7 +104,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--recording", help="with groundtruth.txt and plane.txt; default: a built-in slider before a forest of lines")
     parser.add_argument("--out", type=Path, default=Path("logs/thesis"), help="folder for the figures")
-    parser.add_argument("--events", type=int, default=20000, help="events in a window")
+    parser.add_argument("--events", type=int, default=10000, help="events in a window")
     parser.add_argument("--places", type=int, default=6, help="windows looked at")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -41,3 +41,13 @@ def shared():
     if not (SHARED / "data").is_dir():
         pytest.skip("the recordings in ../shared are not here")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """A small simulated recording in its folder: 0.12 s before a poster, six degrees of freedom."""
+    from torchcmax.simulator import Simulation, write
+
+    folder = tmp_path_factory.mktemp("demo") / "poster"
+    write(Simulation(duration=0.12), folder)
+    return folder

@@ -59,13 +59,24 @@ def build() -> Parser:
 def _add_opening(command: Parser) -> None:
     command.add_argument("recording", type=str, help=RECORDING_HELP)
     command.add_argument("--strict", action="store_true", help="refuse what would be mended: events out of order, or at equal times")
-    command.add_class_arguments(OpenOptions, skip={"strict", "chunk"})
+    command.add_argument("--sensor", type=str, default="", help="width x height in px, like 240x180, instead of what the recording says")
+    command.add_class_arguments(OpenOptions, skip={"strict", "sensor", "chunk"})
 
 
 def _dataclass(kind: type[T], config: Namespace) -> T:
     """The part of the parsed options that belongs to one dataclass."""
     names = {f.name for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in vars(config).items() if name in names})
+
+
+def _opening(config: Namespace) -> OpenOptions:
+    if not config.sensor:
+        return OpenOptions(config.strict, config.camera)
+    try:
+        width, height = (int(number) for number in config.sensor.lower().split("x"))
+    except ValueError:
+        raise ValueError(f"--sensor wants width x height, like 240x180, got {config.sensor!r}") from None
+    return OpenOptions(config.strict, config.camera, (width, height))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -88,8 +99,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
 
 
-def _say(message: Warning | str, category: type[Warning], *place: Any) -> None:
-    if issubclass(category, DataWarning):
+def _say(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: str | None = None) -> None:
+    if issubclass(category, DataWarning):  # others are for developers
         print(f"warning: {message}", file=sys.stderr)
 
 
@@ -106,18 +117,38 @@ def run_simulate(config: Namespace) -> int:
 
 def run_info(config: Namespace) -> int:
     """torchcmax info"""
-    found = summary(open(config.recording, _dataclass(OpenOptions, config)))
-    print(json.dumps(dataclasses.asdict(found), indent=1) if config.json else found)
+    recording = open(config.recording, _opening(config))
+    found = summary(recording)
+    if config.json:
+        print(json.dumps({**about(recording), **dataclasses.asdict(found)}, indent=1))
+    else:
+        print("\n".join(f"{name:<13} {value}" for name, value in about(recording).items()))
+        print(found)
     return 0
+
+
+def about(recording: Recording) -> dict[str, str]:
+    """What is known of a recording before its events are read."""
+    camera, truth, plane = recording.camera, recording.truth, recording.plane
+    height, width = camera.size
+    lens = ", ".join(f"{k:.6g}" for k in camera.distortion)
+    poses = "none" if truth is None else f"{len(truth)} poses, {truth.time[0] * 1e-6:.6f} s to {truth.time[-1] * 1e-6:.6f} s"
+    normal = None if plane is None else " ".join(f"{n:.4f}" for n in plane.normal[0].tolist())
+    return {
+        "recording": recording.name,
+        "sensor": f"{width} x {height}",
+        "calibration": f"fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} px, {camera.model} {lens}",
+        "truth": poses,
+        "plane": "none" if plane is None else f"normal {normal}, {plane.distance[0].item():.4f} m away, in the frame of the first pose",
+    }
 
 
 def run_compensate(config: Namespace) -> int:
     """torchcmax compensate"""
-    options, opening = _dataclass(Compensation, config), _dataclass(OpenOptions, config)
+    options = _dataclass(Compensation, config)
     check_device(options.device)
-    recording = open(config.recording, opening)
-    settings = {"recording": config.recording, **dataclasses.asdict(opening), **dataclasses.asdict(options)}
-    settings.pop("chunk")
+    recording = open(config.recording, _opening(config))
+    settings = {name: getattr(config, name) for name in ("recording", "strict", "camera", "sensor", "images")} | dataclasses.asdict(options)
     text = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
     with (
         Report(Path(config.out), recording, options, text, config.images) as report,

@@ -79,7 +79,7 @@ def test_the_metric_measures_how_far_a_step_moves_the_events(window, kind):
     step = 1e-3 * torch.arange(1, kind.size + 1, dtype=torch.float64).expand(2, -1)
 
     def place(x):
-        ray = model.homography(x, owner, 0.5).transpose(1, 2).flatten(2) @ ink.basis[..., ::2]
+        ray = model.homography(x, owner, 0.5).transpose(1, 2).flatten(2) @ ink.basis[..., :300:2]  # without the spare events at the end
         return 30.0 * ray[:, :2] / ray[:, 2:]
 
     rms = (place(x + step) - place(x)).square().sum(1).mean(-1).sqrt()

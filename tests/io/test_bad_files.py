@@ -261,6 +261,14 @@ def test_saving_where_nothing_can_be_written(tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.h5", "file"]
 
 
+def test_saving_to_a_full_disk(tmp_path, monkeypatch):
+    """HDF5 that runs into a full disk takes the whole process down, so the room is asked for before each chunk."""
+    monkeypatch.setattr("shutil.disk_usage", lambda path: type("usage", (), {"free": 1000}))
+    with pytest.raises(DataError, match=r"No space left on device.*\n.*make room on the disk"):
+        save(noise(10), tmp_path / "a.h5")
+    assert not list(tmp_path.iterdir())
+
+
 def test_saving_a_broken_recording_leaves_nothing_behind(folder, tmp_path):
     recording = open(folder(GOOD + "x y z p\n"), OpenOptions(sensor=(240, 180)))
     (tmp_path / "out").mkdir()

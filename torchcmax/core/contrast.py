@@ -32,8 +32,8 @@ def _smooth(image: Tensor, sigma: float, dim: int) -> Tensor:
     radius, length = max(1, round(3 * sigma)), image.shape[dim]
     kernel = [2.718281828459045 ** (-(i**2) / (2 * sigma**2)) for i in range(radius + 1)]
     total = kernel[0] + 2 * sum(kernel[1:])
-    padded = pad(image, (radius, radius) if dim == -1 else (0, 0, radius, radius))
-    result = image * (kernel[0] / total)
+    padded: Tensor = pad(image, (radius, radius) if dim == -1 else (0, 0, radius, radius))
+    result: Tensor = image * (kernel[0] / total)
     for i in range(1, radius + 1):
         both = padded.narrow(dim, radius - i, length) + padded.narrow(dim, radius + i, length)
         result = torch.add(result, both, alpha=kernel[i] / total)

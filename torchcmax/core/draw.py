@@ -7,12 +7,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchcmax.core.camera import Canvas
 from torchcmax.core.vote import slopes, vote_scatter, votes
 from torchcmax.core.warp import TERMS, monomials, warp
 from torchcmax.core.window import Window
 
+ALIGNED = 16  # windows are padded to a multiple, since a matrix product rounds otherwise where rows begin off a cache line
 NEAREST = 1e-3  # depth of a warped ray below which it counts as behind the camera
 
 
@@ -27,7 +29,9 @@ class Ink:
     def of(cls, window: Window, reference: float = 0.5, signed: bool = False) -> Ink:
         """reference: the time warped to, 0 the window's first event, 1 its last | signed: events vote with their polarity (2.1)."""
         basis = monomials(window.ray, window.phase - reference, TERMS)
-        return cls(basis, window.polarity if signed else window.weight)
+        weight = window.polarity if signed else window.weight
+        spare = (0, -weight.shape[-1] % ALIGNED)
+        return cls(pad(basis, spare), pad(weight, spare))
 
 
 def draw_twin(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
@@ -60,7 +64,7 @@ def _portions(ink: Ink, owner: Tensor) -> list[tuple[slice, Tensor, Tensor]]:
 
 def _project(flat: Tensor, basis: Tensor, weight: Tensor, canvas: Canvas) -> tuple[Tensor, Tensor, Tensor]:
     """flat [A, 3, 3K] -> focal / depth [A, 1, N], offset from the canvas' centre [A, 2, N] px, weight [A, N] or 0 if behind."""
-    ray = flat @ basis
+    ray = flat.clone() @ basis  # a copy begins on a cache line, see ALIGNED
     ahead = ray[:, 2:] > NEAREST
     scale = canvas.focal / torch.where(ahead, ray[:, 2:], 1.0)
     return scale, ray[:, :2] * scale, weight * ahead[:, 0]

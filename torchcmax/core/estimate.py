@@ -57,7 +57,8 @@ class Estimate:
         motion = Motion(self.motion.omega[index], self.motion.velocity[index])
         normal, traces = None if self.normal is None else self.normal[index], tuple(trace[index] for trace in self.traces)
         numbers = (self.H_k, self.contrast_zero, self.contrast, self.iterations, self.evaluations, self.converged)
-        return Estimate(motion, normal, *(number[index] for number in numbers), traces)
+        H_k, zero, contrast, iterations, evaluations, converged = (number[index] for number in numbers)
+        return Estimate(motion, normal, H_k, zero, contrast, iterations, evaluations, converged, traces)
 
     @property
     def gain(self) -> Tensor:

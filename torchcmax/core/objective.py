@@ -13,7 +13,6 @@ from torchcmax.core.contrast import CONTRASTS, blur, normalized
 from torchcmax.core.draw import NEAREST, Ink, draw
 from torchcmax.core.minimize import Objective
 from torchcmax.core.model import Model
-from torchcmax.core.warp import warp
 from torchcmax.core.window import Window
 
 REFERENCES = {"first": 0.0, "middle": 0.5}
@@ -107,9 +106,10 @@ def metric(look: Look, model: Model, ink: Ink, x: Tensor, owner: Tensor, ridge: 
     steps = torch.eye(parameters).to(x)
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
     H_k = model.homography(nearby, owner.repeat_interleave(2 * parameters), REFERENCES[look.reference])
-    ray = warp(H_k, basis.repeat_interleave(2 * parameters, 0))
+    flat, basis = H_k.transpose(1, 2).flatten(2), basis.repeat_interleave(2 * parameters, 0)
+    ray = (flat[..., None] * basis[:, None]).sum(2)  # no matrix products here, which round differently in another batch
     flow = (ray[:, :2] / ray[:, 2:].clamp_min(NEAREST) * model.focal).view(len(x), 2, parameters, -1)
     J = (flow[:, 0] - flow[:, 1]) / 2 * weight[:, None].repeat(1, 1, 2)
-    G = J @ J.mT / weight.sum(-1).clamp_min(1)[:, None, None]
+    G = (J[:, :, None] * J[:, None]).sum(-1) / weight.sum(-1).clamp_min(1)[:, None, None]
     mean = G.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(x.dtype).eps)
     return G + ridge * mean[:, None, None] * torch.eye(parameters).to(x)

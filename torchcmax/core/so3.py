@@ -10,7 +10,7 @@ def hat(w: Tensor) -> Tensor:
     """Cross-product matrix, eq. (2.9): w [..., 3] -> [..., 3, 3]."""
     x, y, z = w.unbind(-1)
     o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).view(*w.shape[:-1], 3, 3)
 
 
 def _sine_ratios(w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -45,10 +45,9 @@ def to_quaternion(R: Tensor) -> Tensor:
 
     Of the four algebraically equal rows the one with the largest pivot is taken, so nothing is divided by a small number.
     """
-    m = R.unflatten(-1, (3,)) if R.ndim < 2 else R
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    xy, yz, zx = m[..., 0, 1] + m[..., 1, 0], m[..., 1, 2] + m[..., 2, 1], m[..., 2, 0] + m[..., 0, 2]
-    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    xy, yz, zx = R[..., 0, 1] + R[..., 1, 0], R[..., 1, 2] + R[..., 2, 1], R[..., 2, 0] + R[..., 0, 2]
+    wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     rows = torch.stack(
         [
             torch.stack([1 + xx - yy - zz, xy, zx, wx], -1),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ STORED = 1 << 17  # events per compressed piece of a file
 WANTS = "it wants the datasets events/t (integer us), events/x, events/y (px), events/p (0 or 1), of the same length"
 FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on broken files
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF5 crashes the process when it finds it full
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ def save(recording: Recording, path: Path | str) -> None:
             raise DataError(path, f"{path.parent} is no folder", "make the folder first, or choose another")
         with h5py.File(part, "w") as file:
             _write_rest(file, recording)
-            _write_events(file.create_group("events"), recording)
+            _write_events(file.create_group("events"), recording, path.parent)
         part.replace(path)
     except (OSError, RuntimeError) as error:
         raise DataError(path, f"cannot be written: {error}", remedy) from error
@@ -167,12 +170,14 @@ def _write_rest(file: Any, recording: Recording) -> None:
         file["plane"] = torch.cat([recording.plane.normal[0], recording.plane.distance]).double().numpy()
 
 
-def _write_events(group: Any, recording: Recording) -> None:
+def _write_events(group: Any, recording: Recording, folder: Path) -> None:
     """Datasets that grow with every chunk."""
     packed = {"chunks": (STORED,), "compression": "gzip", "compression_opts": 1, "shuffle": True}
     columns = {name: group.create_dataset(name, (0,), kind, maxshape=(None,), **packed) for name, kind in NAMES.items()}
     count = 0
     for chunk in recording.chunks():
+        if shutil.disk_usage(folder).free < BYTES_PER_EVENT * len(chunk) + SPARE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
         for name, column in columns.items():
             column.resize((count + len(chunk),))
             column[count:] = getattr(chunk, name)

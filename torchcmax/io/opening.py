@@ -29,10 +29,14 @@ WANTED = "give a folder with events.txt (lines t x y p) or events.h5, and calib.
 class OpenOptions:
     """How a recording is opened."""
 
-    strict: bool = False  # refuse what would be mended: events out of order, or at equal times
-    camera: str = ""  # calibration file instead of the recording's own: ECD form, YAML, or the word pinhole
-    sensor: tuple[int, int] | None = None  # width, height px, instead of what the recording says
-    chunk: int = 1 << 20  # events read at a time, and how many places an event out of order can be moved
+    strict: bool = False
+    """Refuse what would be mended: events out of order, or at equal times."""
+    camera: str = ""
+    """Calibration file instead of the recording's own: ECD form, YAML, or the word pinhole."""
+    sensor: tuple[int, int] | None = None
+    """Width, height px, instead of what the recording says."""
+    chunk: int = 1 << 20
+    """Events read at a time, and how many places an event out of order can be moved."""
 
 
 def open(path: Path | str, options: OpenOptions | None = None) -> Recording:

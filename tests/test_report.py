@@ -1,0 +1,163 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchcmax.compensate import Compensation, compensate
+from torchcmax.core.camera import Canvas
+from torchcmax.io import DataError, open
+from torchcmax.report import COLUMNS, Report, captioned, coloured, pictures, rows, writing
+
+HEADER = "index,start_us,end_us,events,contrast_zero,contrast,gain,omega_x,omega_y,omega_z,v_x,v_y,v_z,n_x,n_y,n_z,evaluations,converged"
+
+
+@pytest.fixture(scope="module")
+def results(demo):
+    """Four windows in batches of three, with the free plane."""
+    recording, options = open(demo), Compensation(model="planar", events=6000, batch=3, limit=4)
+    return recording, options, list(compensate(recording, options))
+
+
+def report(folder, results, every=2):
+    recording, options, parts = results
+    with Report(folder, recording, options, "model: planar\n", every) as written:
+        for window, estimate in parts:
+            written.add(window, estimate)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(results, tmp_path_factory):
+    return report(tmp_path_factory.mktemp("run") / "new" / "folder", results)
+
+
+def test_windows_csv_has_the_columns_and_the_numbers_of_the_estimates(folder, results):
+    text = (folder / "windows.csv").read_text()
+    assert text.splitlines()[0] == HEADER
+    lines = list(csv.DictReader(text.splitlines()))
+    assert [int(line["index"]) for line in lines] == [0, 1, 2, 3]
+    window, estimate = results[2][0]
+    for i in range(3):
+        line = lines[i]
+        assert int(line["start_us"]) == window.start[i]
+        assert int(line["end_us"]) == window.start[i] + round(window.duration[i].item() * 1e6)
+        assert int(line["events"]) == 6000
+        for name, vector in (("omega", estimate.motion.omega), ("v", estimate.motion.velocity), ("n", estimate.normal)):
+            found = [float(line[f"{name}_{axis}"]) for axis in "xyz"]
+            np.testing.assert_allclose(found, vector[i].numpy(), rtol=1e-6)
+        assert float(line["gain"]) == pytest.approx(float(line["contrast"]) / float(line["contrast_zero"]), rel=1e-5)
+        assert int(line["evaluations"]) == estimate.evaluations[i]
+        assert line["converged"] == str(int(estimate.converged[i]))
+
+
+def test_a_model_without_a_plane_leaves_the_normal_empty(demo, tmp_path):
+    recording, options = open(demo), Compensation(events=6000, limit=1)
+    report(tmp_path / "run", (recording, options, list(compensate(recording, options))))
+    line = next(csv.DictReader((tmp_path / "run" / "windows.csv").open()))
+    assert [line[f"n_{axis}"] for axis in "xyz"] == ["", "", ""]
+    assert [line[f"v_{axis}"] for axis in "xyz"] == ["0", "0", "0"]
+
+
+def test_pictures_are_of_every_second_window(folder):
+    assert sorted(p.name for p in (folder / "images").iterdir()) == ["window_00000.png", "window_00002.png"]
+    picture = Image.open(folder / "images" / "window_00000.png")
+    assert picture.size == (2 * (240 + 2 * 60), 180 + 2 * 45 + 22)
+
+
+def test_summary_counts_what_was_done(folder):
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["complete"] is True
+    assert summary["windows"] == 4
+    assert summary["events"] == 24000
+    assert summary["pictures"] == 2
+    assert summary["gain_median"] > 1
+
+
+def test_tensorboard_reads_it_back(folder):
+    board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
+    board.Reload()
+    tags = board.Tags()
+    for name in ("contrast", "contrast_zero", "gain", "omega_x", "v_z", "n_y", "evaluations", "events_per_second"):
+        assert [event.step for event in board.Scalars(f"window/{name}")] == [0, 1, 2, 3]
+    assert [event.step for event in board.Images("before_after")] == [0, 2]
+    curves = [tag for tag in tags["scalars"] if tag.startswith("optimizer/")]
+    assert set(curves) == {f"optimizer/window_0000{i}/blur_{b}_px" for i in (0, 2) for b in (4, 2, 1)}
+    values = [event.value for event in board.Scalars("optimizer/window_00000/blur_1_px")]
+    assert values[-1] >= values[0]
+    assert "config/text_summary" in tags["tensors"]
+
+
+def test_a_run_that_breaks_off_keeps_what_is_done_and_says_so(results, tmp_path):
+    recording, options, parts = results
+
+    def break_off():
+        with Report(tmp_path, recording, options, "", 1) as written:
+            written.add(*parts[0])
+            raise DataError("events.txt", "letters in a column", "mend it", "line 7")
+
+    with pytest.raises(DataError):
+        break_off()
+    assert len((tmp_path / "windows.csv").read_text().splitlines()) == 4
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert "line 7" in summary["stopped_by"]
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_second_run_replaces_the_first_and_nothing_else(results, tmp_path):
+    report(tmp_path, results, every=1)
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "images" / "mine.png").write_text("mine")
+    report(tmp_path, results, every=4)
+    assert sorted(p.name for p in (tmp_path / "images").iterdir()) == ["mine.png", "window_00000.png"]
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_named(results, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot be written to"):
+        report(tmp_path / "file" / "run", results)
+
+
+def test_a_disk_that_fills_up_is_named_and_leaves_no_torn_file(tmp_path):
+    def fill():
+        with writing(tmp_path / "a.png") as name:
+            name.write_bytes(b"half")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(DataError, match="No space left on device"):
+        fill()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_picture_shows_on_red_off_blue_and_both_dark():
+    on, off = torch.zeros(4, 4), torch.zeros(4, 4)
+    on[0, 0], off[1, 1] = 1, 1
+    on[2, 2], off[2, 2] = 1, 1
+    picture = coloured(on, off)
+    assert tuple(picture[0, 0]) == (255, picture[0, 0][1], picture[0, 0][2])
+    assert picture[0, 0][2] < 128
+    assert picture[1, 1][0] < 128
+    assert picture[1, 1][2] == 255
+    assert picture[2, 2].max() < 128
+    assert (picture[3, 3] == 255).all()
+    assert captioned(picture, "text").shape == (26, 4, 3)
+
+
+def test_the_second_half_of_a_picture_is_sharper(demo):
+    recording, options = open(demo), Compensation(model="planar", limit=1)
+    window, estimate = next(compensate(recording, options))
+    drawn = 255.0 - pictures(window, estimate, Canvas.around(recording.camera, options.search.margin), 0.5).mean(-1)
+    before, after = np.split(drawn, 2, axis=2)
+    assert (np.count_nonzero(after, axis=(1, 2)) < 0.9 * np.count_nonzero(before, axis=(1, 2))).all()  # fewer pixels, more events each
+
+
+def test_rows_have_every_column(results):
+    lines = rows(*results[2][0], first=7)
+    assert list(lines[0]) == list(COLUMNS)
+    assert [line["index"] for line in lines] == [7, 8, 9]
