@@ -12,7 +12,6 @@ from PIL import Image
 from torch import Tensor
 
 from torchcmax.core.camera import Canvas
-from torchcmax.core.draw import Ink, draw
 from torchcmax.core.estimate import round_of
 from torchcmax.core.minimize import Stop
 from torchcmax.core.model import Displacement, Planar
@@ -20,7 +19,7 @@ from torchcmax.core.objective import Look
 from torchcmax.core.pose import Motion
 from torchcmax.core.window import Window
 from torchcmax.io import Recording, open
-from torchcmax.report import captioned, coloured, writing
+from torchcmax.report import captioned, pictures, writing
 from torchcmax.simulator import Simulation, simulate
 
 THESIS = Look(polarity="signed", reference="first", tilt=0.0)
@@ -91,18 +90,15 @@ def spelled(displacement: Displacement, window: Window, row: int, i: int) -> dic
 
 def side_by_side(window: Window, model: Planar, canvas: Canvas, x: list[Tensor], contrast: tuple[float, float]) -> Image.Image:
     """Truth | wrong optimum, in colours."""
-    basis, none = Ink.of(window, 0.0).basis, torch.zeros(1, dtype=torch.int64)
-    on, off = (
-        torch.cat([draw(model.homography(p, none, 0.0), Ink(basis, (sign * window.polarity).clamp_min(0)), canvas, none) for p in x], -1)[0]
-        for sign in (1, -1)
-    )
+    none = torch.zeros(1, dtype=torch.int64)
+    (picture,) = pictures(window, tuple(model.homography(p, none, 0.0) for p in x), canvas, 0.0)
     text = f"truth: contrast {contrast[0]:.5f} | wrong motion and plane: contrast {contrast[1]:.5f}"
-    return Image.fromarray(captioned(coloured(on, off), text))
+    return Image.fromarray(captioned(picture, text))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--recording", help="with groundtruth.txt and plane.txt; default: a built-in slider before a forest of lines")
+    parser.add_argument("--recording", help="with groundtruth.txt and plane.txt; default: a built-in slider before a poster")
     parser.add_argument("--out", type=Path, default=Path("logs/thesis"), help="folder for the figures")
     parser.add_argument("--events", type=int, default=10000, help="events in a window")
     parser.add_argument("--places", type=int, default=6, help="windows looked at")

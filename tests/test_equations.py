@@ -64,7 +64,7 @@ def test_eq_2_1_the_image_sums_signed_events_at_their_warped_places():
         torch.tensor([0.2]).double(),
     )
     still = polynomial(*(torch.zeros(1, 3, dtype=DOUBLE) for _ in range(2)), torch.tensor([[0.0, 0.0, -1.0]], dtype=DOUBLE))
-    image = draw(still, Ink.of(window, signed=True), Canvas(10.0, (5.0, 5.0), (11, 11)), torch.zeros(1).long())
+    image = draw(still, Ink.of(window, window.polarity), Canvas(10.0, (5.0, 5.0), (11, 11)), torch.zeros(1).long())
     expected = torch.zeros(1, 11, 11, dtype=DOUBLE)
     expected[0, 5, 2] = 1  # the other two cancel
     equal(image, expected)

@@ -65,17 +65,22 @@ def rows(window: Window, estimate: Estimate, first: int) -> list[dict[str, float
     return [dict(zip(COLUMNS, line, strict=True)) for line in table.double().tolist()]
 
 
-def pictures(window: Window, estimate: Estimate, canvas: Canvas, reference: float) -> np.ndarray:
-    """Each window before | after: brighter (ON) events red, darker (OFF) blue, as many shades for both sides: -> [B, H, 2 W, 3] uint8."""
+def pictures(window: Window, warps: tuple[Tensor, ...], canvas: Canvas, reference: float) -> np.ndarray:
+    """Each window warped in several ways side by side: brighter (ON) events red, darker (OFF) blue, one scale for all sides.
+
+    warps: H_k [B, K, 3, 3] each -> [B, H, W * len(warps), 3] uint8
+    """
     owner = torch.arange(len(window), device=window.ray.device)
-    still = torch.zeros_like(estimate.H_k)
+    on, off = (Ink.of(window, (sign * window.polarity).clamp_min(0), reference) for sign in (1, -1))
+    red, blue = (torch.cat([draw(H_k, ink, canvas, owner) for H_k in warps], -1).cpu() for ink in (on, off))
+    return np.stack([coloured(a, b) for a, b in zip(red, blue, strict=True)])
+
+
+def at_rest(H_k: Tensor) -> Tensor:
+    """The warp that leaves every ray where it is, as many as there are in H_k [B, K, 3, 3]."""
+    still = torch.zeros_like(H_k)
     still[:, 0] = torch.eye(3).to(still)
-    basis = Ink.of(window, reference).basis
-    on, off = (
-        torch.cat([draw(H, Ink(basis, (sign * window.polarity).clamp_min(0)), canvas, owner) for H in (still, estimate.H_k)], -1)
-        for sign in (1, -1)
-    )
-    return np.stack([coloured(a, b) for a, b in zip(on.cpu(), off.cpu(), strict=True)])
+    return still
 
 
 def coloured(on: Tensor, off: Tensor) -> np.ndarray:
@@ -149,7 +154,8 @@ class Report:
         if not chosen:
             return
         index = torch.tensor(chosen, device=window.ray.device)
-        drawn = pictures(window[index], estimate[index], self.canvas, REFERENCES[self.options.look.reference])
+        warps = at_rest(estimate.H_k[index]), estimate.H_k[index]
+        drawn = pictures(window[index], warps, self.canvas, REFERENCES[self.options.look.reference])
         for i, picture in zip(chosen, drawn, strict=True):
             line, number = lines[i], int(lines[i]["index"])
             seconds = (line["end_us"] - line["start_us"]) * 1e-6

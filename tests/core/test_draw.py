@@ -29,7 +29,7 @@ def H_k(rand):
 @pytest.mark.parametrize("signed", [False, True])
 def test_draw_is_its_readable_twin_in_value_and_gradient(window, H_k, rand, dtype, device, signed):
     tolerance = {torch.float32: {"rtol": 2e-3, "atol": 2e-3}, torch.float64: {"rtol": 1e-9, "atol": 1e-9}}[dtype]
-    ink, owner = Ink.of(window, 0.5, signed), torch.tensor([0, 0, 1, 2, 1], device=device)
+    ink, owner = Ink.of(window, window.polarity if signed else window.weight), torch.tensor([0, 0, 1, 2, 1], device=device)
     back = rand(5, *CANVAS.size)
     results = []
     for how in (draw, draw_twin):
@@ -41,7 +41,7 @@ def test_draw_is_its_readable_twin_in_value_and_gradient(window, H_k, rand, dtyp
 
 
 def test_a_row_is_the_same_alone_and_in_any_batch(window, H_k, device):
-    ink, owner = Ink.of(window), torch.tensor([0, 0, 1, 2, 1], device=device)
+    ink, owner = Ink.of(window, window.weight), torch.tensor([0, 0, 1, 2, 1], device=device)
     together = draw(H_k, ink, CANVAS, owner)
     for i in range(5):
         assert torch.equal(draw(H_k[i : i + 1], ink, CANVAS, owner[i : i + 1])[0], together[i])
@@ -50,15 +50,15 @@ def test_a_row_is_the_same_alone_and_in_any_batch(window, H_k, device):
 def test_padding_draws_nothing(window, H_k, device, close):
     owner = torch.arange(3, device=device)
     short = Window(window.ray[:, :70], window.dt[:, :70], window.polarity[:, :70], window.start, window.duration)
-    close(draw(H_k[:3], Ink.of(window), CANVAS, owner), draw(H_k[:3], Ink.of(short), CANVAS, owner))
+    close(draw(H_k[:3], Ink.of(window, window.weight), CANVAS, owner), draw(H_k[:3], Ink.of(short, short.weight), CANVAS, owner))
 
 
 def test_signed_votes_cancel_and_unsigned_add(window, H_k, device):
     ray, dt = window.ray.repeat(1, 2, 1), window.dt.repeat(1, 2)
     both = Window(ray, dt, torch.cat([window.weight, -window.weight], 1), window.start, window.duration)
     owner = torch.arange(3, device=device)
-    assert draw(H_k[:3], Ink.of(both, signed=True), CANVAS, owner).abs().max() < 1e-5
-    assert draw(H_k[:3], Ink.of(both), CANVAS, owner).sum() > 100
+    assert draw(H_k[:3], Ink.of(both, both.polarity), CANVAS, owner).abs().max() < 1e-5
+    assert draw(H_k[:3], Ink.of(both, both.weight), CANVAS, owner).sum() > 100
 
 
 def test_events_behind_the_camera_are_left_out_without_nan(window, device):
@@ -67,7 +67,7 @@ def test_events_behind_the_camera_are_left_out_without_nan(window, device):
     backwards[:, 0] = -torch.eye(3).to(window.ray)
     H = backwards.requires_grad_()
     for how in (draw, draw_twin):
-        image = how(H, Ink.of(window), CANVAS, owner)
+        image = how(H, Ink.of(window, window.weight), CANVAS, owner)
         (gradient,) = torch.autograd.grad(image.sum(), H)
         assert (image == 0).all()
         assert gradient.isfinite().all()

@@ -26,10 +26,9 @@ class Ink:
     weight: Tensor
 
     @classmethod
-    def of(cls, window: Window, reference: float = 0.5, signed: bool = False) -> Ink:
-        """reference: the time warped to, 0 the window's first event, 1 its last | signed: events vote with their polarity (2.1)."""
+    def of(cls, window: Window, weight: Tensor, reference: float = 0.5) -> Ink:
+        """weight [W, N] that events vote with | reference: the time warped to, 0 the window's first event, 1 its last."""
         basis = monomials(window.ray, window.phase - reference, TERMS)
-        weight = window.polarity if signed else window.weight
         spare = (0, -weight.shape[-1] % ALIGNED)
         return cls(pad(basis, spare), pad(weight, spare))
 

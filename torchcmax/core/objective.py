@@ -44,7 +44,8 @@ class Look:
 
     def ink(self, window: Window) -> Ink:
         """The window made ready for many warps."""
-        return Ink.of(window, REFERENCES[self.reference], self.polarity == "signed")
+        weight = window.polarity if self.polarity == "signed" else window.weight
+        return Ink.of(window, weight, REFERENCES[self.reference])
 
     def sharpness(self, H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor, sigma: float) -> Tensor:
         """Normalized contrast of the image of warped events, blurred by sigma canvas px: -> [A]."""

@@ -62,30 +62,32 @@ def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
     """Sorts within two chunks: one is held back, so that late events of the next can still go before it."""
     held: Events | None = None
     handed, seen, late, where = np.iinfo(np.int64).min, 0, 0, ""
-    for chunk in chunks:
-        if not len(chunk):
-            continue
-        newest = chunk.t[0] if held is None else held.t[-1]
-        before = np.concatenate([newest[None], chunk.t[:-1]])
-        if source.strict:
-            _refuse(chunk, before, seen, source)
-        if (chunk.t >= before).all():
-            ready, held = held, chunk
-        else:
-            behind = np.flatnonzero(chunk.t < np.maximum.accumulate(before))
-            late, where = late + len(behind), where or source.place(seen + int(behind[0]))
-            if chunk.t.min() < handed:
-                raise _too_late(chunk, handed, seen, source)
-            ready, held = _merged(held, chunk)
-        seen += len(chunk)
-        if ready is not None and len(ready):
-            handed = int(ready.t[-1])
-            yield ready
-    if held is not None:
-        yield held
-    if late:
-        text = f"{source.path}: {late} of {seen} events were out of order and have been sorted, the first at {where}"
-        warnings.warn(Reordered(text, late), stacklevel=2)
+    try:
+        for chunk in chunks:
+            if not len(chunk):
+                continue
+            newest = chunk.t[0] if held is None else held.t[-1]
+            before = np.concatenate([newest[None], chunk.t[:-1]])
+            if source.strict:
+                _refuse(chunk, before, seen, source)
+            if (chunk.t >= before).all():
+                ready, held = held, chunk
+            else:
+                behind = np.flatnonzero(chunk.t < np.maximum.accumulate(before))
+                if chunk.t.min() < handed:
+                    raise _too_late(chunk, handed, seen, source)
+                late, where = late + len(behind), where or source.place(seen + int(behind[0]))
+                ready, held = _merged(held, chunk)
+            seen += len(chunk)
+            if ready is not None and len(ready):
+                handed = int(ready.t[-1])
+                yield ready
+        if held is not None:
+            yield held
+    finally:  # also when nobody wants the rest of the events
+        if late:
+            text = f"{source.path}: {late} of {seen} events were out of order and have been sorted, the first at {where}"
+            warnings.warn(Reordered(text, late), stacklevel=2)
 
 
 def _merged(held: Events | None, chunk: Events) -> tuple[Events, Events]:
