@@ -72,23 +72,20 @@ def _project(flat: Tensor, basis: Tensor, weight: Tensor, canvas: Canvas) -> tup
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, flat: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
-        ctx.save_for_backward(flat)
-        ctx.rest = ink, canvas, owner
-        image = flat.new_empty(len(flat), *canvas.size)
+        image, projected = flat.new_empty(len(flat), *canvas.size), []
         for rows, basis, weight in _portions(ink, owner):
-            _, offset, weight = _project(flat[rows], basis, weight, canvas)
+            scale, offset, weight = _project(flat[rows], basis, weight, canvas)
             image[rows] = votes(offset.mT + flat.new_tensor(canvas.centre), weight, canvas.size)
+            projected.append((rows, basis, weight, scale, offset))
+        ctx.canvas, ctx.projected = canvas, projected
         return image
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        (flat,) = ctx.saved_tensors
-        ink, canvas, owner = ctx.rest
-        result = torch.empty_like(flat)
-        for rows, basis, weight in _portions(ink, owner):
-            scale, offset, weight = _project(flat[rows], basis, weight, canvas)
-            slope = slopes(gradient[rows], offset.mT + flat.new_tensor(canvas.centre), weight).mT
-            to_ray = torch.cat([slope, -(slope * offset).sum(1, keepdim=True) / canvas.focal], 1) * scale
-            result[rows] = to_ray @ basis.mT
-        return result, None, None, None
+        result = []
+        for rows, basis, weight, scale, offset in ctx.projected:
+            slope = slopes(gradient[rows], offset.mT + offset.new_tensor(ctx.canvas.centre), weight).mT
+            to_ray = torch.cat([slope, -(slope * offset).sum(1, keepdim=True) / ctx.canvas.focal], 1) * scale
+            result.append(to_ray @ basis.mT)
+        return torch.cat(result), None, None, None
