@@ -40,12 +40,13 @@ def figure_2_3(recording: Recording, events: int, places: int) -> tuple[dict[str
     tried = x_true[:, None].repeat(1, starts, 1)
     tried[:, 1:, 6:] = tilt[:, 1:]  # the first starts at the truth, the others look for a wrong plane
     stop = Stop(tolerance=1e-3, iterations=100)
-    found = round_of(window, model, THESIS, canvas, 1.0, tried.flatten(0, 1), stop)
-    found = round_of(window, model, THESIS, canvas, 0.0, found.x, stop)
+    sharp = THESIS.at(window, canvas, 0.0)
+    found = round_of(THESIS, model, THESIS.at(window, canvas, 1.0), tried.flatten(0, 1), stop)
+    found = round_of(THESIS, model, sharp, found.x, stop)
 
-    owner = torch.arange(len(window)).repeat_interleave(starts)
-    ink = THESIS.ink(window)
-    true_contrast = THESIS.sharpness(model.homography(x_true, torch.arange(len(window)), 0.0), ink, canvas, torch.arange(len(window)), 0.0)
+    each = torch.arange(len(window))
+    owner = each.repeat_interleave(starts)
+    true_contrast = THESIS.sharpness(model.homography(x_true, each, 0.0), sharp, each)
     contrast, wrong = (-found.value).exp(), model.displacement(found.x, owner)
     angle = (wrong.normal * truth.normal[owner]).sum(-1).clamp(-1, 1).arccos().rad2deg()
     in_view = (

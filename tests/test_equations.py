@@ -280,7 +280,7 @@ def test_the_whole_chain_is_the_product_of_its_links(ray):
     window = Window(ray, dt, torch.ones(2, 20, dtype=DOUBLE), torch.zeros(2).long(), dt[:, -1])
     canvas, model, look = Canvas(30.0, (20.3, 18.7), (40, 42)), Planar(30.0), Look(reference="first", guard=0.0, tilt=0.0)
     x = 2 * (rand(2, 8, seed=6) - 0.5)
-    _, gradient = objective(look, model, look.ink(window), canvas, 0.0, torch.arange(2))(x, torch.arange(2))
+    _, gradient = objective(look, model, look.at(window, canvas, 0.0), torch.arange(2))(x, torch.arange(2))
 
     def spelled_out(x):
         d = model.displacement(x, torch.arange(2))

@@ -4,14 +4,11 @@ import math
 
 import pytest
 import torch
+from accuracy import FAST, ROTATIONS, end_point_error, from_random_starts, sample, whole
 
-from torchcmax.core.camera import Canvas
-from torchcmax.core.estimate import Search, best_of, estimate, round_of
+from torchcmax.core.estimate import Search, estimate
 from torchcmax.core.model import MODELS, PlanarKnown, Rotation
 from torchcmax.core.objective import Look
-from torchcmax.core.plane import Plane
-from torchcmax.core.pose import Motion
-from torchcmax.core.warp import transfer
 from torchcmax.io import open
 
 
@@ -23,41 +20,23 @@ def judge(shared, monkeypatch):
     return score
 
 
-def whole(folder):
-    recording = open(folder)
-    (window,) = recording.windows(sum(len(chunk) for chunk in recording.chunks()))
-    return recording.camera, window
-
-
-@pytest.mark.parametrize(
-    ("name", "known", "degrees", "contrast"),
-    [
-        ("boxes_rotation_13s", (0.583, -1.208, 0.065), 2.0, 1.117),
-        ("shapes_rotation_2s", (-0.071, 0.663, -0.128), 0.5, 2.275),
-    ],
-)
-def test_moderate_rotations_are_found_as_exactly_as_by_the_best_published_estimator(shared, judge, name, known, degrees, contrast):
+@pytest.mark.parametrize(("name", "degrees", "contrast"), [("boxes_rotation_13s", 2.0, 1.117), ("shapes_rotation_2s", 0.5, 2.275)])
+def test_moderate_rotations_are_found_as_exactly_as_by_the_best_published_estimator(shared, judge, name, degrees, contrast):
     camera, window = whole(shared / "data/real/ecd" / name)
     found = estimate(window, camera, Rotation(camera.fx))
-    error = (found.motion.omega[0] - torch.tensor(known)).norm() * 180 / math.pi
+    error = (found.motion.omega[0] - torch.tensor(ROTATIONS[name])).norm() * 180 / math.pi
     assert error < degrees
     assert judge(shared / "data/real/ecd" / name, found.motion.omega[0].tolist())["middle_sigma1"]["gain"] >= contrast
     assert found.converged.all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["boxes_rotation", "dynamic_rotation", "boxes_translation", "shapes_translation"])
+@pytest.mark.parametrize("name", FAST)
 def test_fast_windows_reach_what_fifty_random_starts_find(shared, judge, name):
     """99.9 % of the gain over the image at rest, by our contrast and by the independent judge's."""
     camera, window = whole(shared / "data/real/ecd" / name)
-    model, look, search = MODELS[name.split("_")[1]](camera.fx), Look(), Search()
-    found = estimate(window, camera, model, look, search)
-
-    x = 80 * (torch.rand(50, model.size, generator=torch.Generator().manual_seed(0)) - 0.5)
-    for sigma in search.blur:
-        every = round_of(window, model, look, Canvas.around(camera, search.margin), sigma, x, search.stop)
-        x = every.x
-    best = best_of(every, 1)
+    model = MODELS[name.split("_")[1]](camera.fx)
+    found, best = estimate(window, camera, model), from_random_starts(window, camera, model)
     best_gain = (-best.value).exp() / found.contrast_zero
     assert (found.gain - 1) >= 0.999 * (best_gain - 1)
 
@@ -68,27 +47,6 @@ def test_fast_windows_reach_what_fifty_random_starts_find(shared, judge, name):
     there = model.displacement(best.x, torch.zeros(1, dtype=torch.int64))
     ours = judged(found.motion.omega * window.duration, found.motion.velocity * window.duration)
     assert ours - 1 >= 0.999 * (judged(there.turn, there.shift) - 1)
-
-
-def sample(recording, count, events=30000):
-    """Windows spread evenly over a recording, with their true motion and plane in the frame of their first event."""
-    total = recording.count
-    stride = (total - events) // (count - 1)
-    window = next(recording.windows(events, stride, count))
-    motion, pose = recording.truth.motion(window.start, window.duration.double()), recording.truth.at(window.start)
-    plane = recording.plane.seen_from(pose)
-    return window, Motion(motion.omega, motion.velocity / plane.distance[:, None]), Plane(plane.normal, torch.ones(count).double())
-
-
-def end_point_error(window, found, truth, plane, focal):
-    """Median over a window's events of the distance between where the two motions warp them, px: [B]."""
-
-    def warped(motion, plane):
-        ray = transfer(window.ray.double(), Motion(motion.omega.double(), motion.velocity.double()).at(window.dt.double()), plane)
-        return focal * ray[..., :2] / ray[..., 2:]
-
-    estimated = plane if found.normal is None else Plane(found.normal.double(), plane.distance)
-    return (warped(found.motion, estimated) - warped(truth, plane)).norm(dim=-1).median(-1).values
 
 
 @pytest.mark.parametrize("name", ["poster_6dof_sim", "shapes_6dof_sim"])

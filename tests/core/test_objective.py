@@ -35,7 +35,7 @@ def test_an_unknown_contrast_is_named():
 def test_the_gradient_is_that_of_central_differences(window, kind, reference):
     """Through blur, vote, warp and guard; float64, blurred, so that the kinks of the bilinear vote are small."""
     look, model, owner = Look(reference=reference, deformation=1.01), kind(30.0), torch.tensor([0, 1])
-    f = objective(look, model, look.ink(window), CANVAS, 2.0, owner)
+    f = objective(look, model, look.at(window, CANVAS, 2.0), owner)
     g = torch.Generator().manual_seed(5)
     x = 4 * (torch.rand(2, kind.size, generator=g, dtype=torch.float64) - 0.5)
     _, gradient = f(x, owner)
@@ -73,7 +73,7 @@ def test_deformation_is_the_change_of_a_small_triangle(dtype):
 @KINDS
 def test_the_metric_measures_how_far_a_step_moves_the_events(window, kind):
     look, model, owner = Look(), kind(30.0), torch.tensor([0, 1])
-    ink = look.ink(window)
+    ink = look.at(window, CANVAS, 0.0).ink
     x = torch.ones(2, kind.size, dtype=torch.float64)
     G = metric(look, model, ink, x, owner, ridge=0.0)
     step = 1e-3 * torch.arange(1, kind.size + 1, dtype=torch.float64).expand(2, -1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.minimize import Minimum, Stop, minimize
 from torchcmax.core.model import Displacement, Model
-from torchcmax.core.objective import REFERENCES, Look, metric, objective
+from torchcmax.core.objective import REFERENCES, Look, View, metric, objective
 from torchcmax.core.pose import Motion
 from torchcmax.core.window import Window
 
@@ -80,14 +80,14 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
     for index, sigma in enumerate(search.blur):
         if model.free_plane and index == len(search.blur) - 1:
             x = with_twins(x, model, REFERENCES[look.reference])
-        every = round_of(window, model, look, canvas, sigma, x, search.stop)
+        every = round_of(look, model, look.coarsely_at(window, canvas, sigma), x, search.stop)
         iterations = iterations + every.iterations.view(len(window), -1).sum(-1)
         evaluations = evaluations + every.evaluations.view(len(window), -1).sum(-1)
         found = best_of(every, len(window))
         traces.append((-found.trace).exp())
         x = found.x
     found = replace(found, iterations=iterations, evaluations=evaluations)
-    return _report(window, model, look, canvas, search.blur[-1], found, traces)
+    return _report(window, model, look, look.at(window, canvas, search.blur[-1]), found, tuple(traces))
 
 
 def starts(window: Window, model: Model, far: float) -> Tensor:
@@ -104,12 +104,11 @@ def with_twins(x: Tensor, model: Model, reference: float) -> Tensor:
     return torch.stack([x, model.parameters(here.twin().seen_at(-reference))], 1).flatten(0, 1)
 
 
-def round_of(window: Window, model: Model, look: Look, canvas: Canvas, sigma: float, x: Tensor, stop: Stop) -> Minimum:
-    """One round of the search, from x [B * C, P]: at sigma px of blur one event in sigma will do, and a coarser canvas."""
-    owner = torch.arange(len(window), device=x.device).repeat_interleave(len(x) // len(window))
-    factor = min(1.0, 2 / sigma) if sigma else 1.0
-    canvas, ink = canvas.scaled(factor), look.ink(window.thinned(max(1, int(sigma))))
-    return minimize(objective(look, model, ink, canvas, sigma * factor, owner), x, metric(look, model, ink, x, owner), stop)
+def round_of(look: Look, model: Model, view: View, x: Tensor, stop: Stop | None = None) -> Minimum:
+    """One round of the search, from C candidates for each window of the view: x [B * C, P]."""
+    windows = len(view.ink.weight)
+    owner = torch.arange(windows, device=x.device).repeat_interleave(len(x) // windows)
+    return minimize(objective(look, model, view, owner), x, metric(look, model, view.ink, x, owner), stop)
 
 
 def best_of(every: Minimum, windows: int) -> Minimum:
@@ -125,12 +124,12 @@ def rates(displacement: Displacement, window: Window) -> Motion:
     return Motion(displacement.turn * per_second, displacement.shift * per_second)
 
 
-def _report(window: Window, model: Model, look: Look, canvas: Canvas, sigma: float, found: Minimum, traces: list[Tensor]) -> Estimate:
+def _report(window: Window, model: Model, look: Look, view: View, found: Minimum, traces: tuple[Tensor, ...]) -> Estimate:
     """The last minimum of every window, in units that people read, with the contrast that all its events have."""
-    owner, ink = torch.arange(len(window), device=found.x.device), look.ink(window)
+    owner = torch.arange(len(window), device=found.x.device)
     with torch.no_grad():
         H_k, H_zero = (model.homography(x, owner, REFERENCES[look.reference]) for x in (found.x, torch.zeros_like(found.x)))
-        contrast, zero = (look.sharpness(H, ink, canvas, owner, sigma) for H in (H_k, H_zero))
+        contrast, zero = (look.sharpness(H, view, owner) for H in (H_k, H_zero))
         displacement = model.displacement(found.x, owner)
     return Estimate(
         motion=rates(displacement, window),
@@ -141,5 +140,5 @@ def _report(window: Window, model: Model, look: Look, canvas: Canvas, sigma: flo
         iterations=found.iterations,
         evaluations=found.evaluations,
         converged=found.converged,
-        traces=tuple(traces),
+        traces=traces,
     )

@@ -42,15 +42,29 @@ class Look:
             if value not in names:
                 raise ValueError(f"{value!r} is none of {', '.join(names)}")
 
-    def ink(self, window: Window) -> Ink:
-        """The window made ready for many warps."""
+    def at(self, window: Window, canvas: Canvas, sigma: float) -> View:
+        """All events of the window on the canvas, blurred by sigma px."""
         weight = window.polarity if self.polarity == "signed" else window.weight
-        return Ink.of(window, weight, REFERENCES[self.reference])
+        return View(Ink.of(window, weight, REFERENCES[self.reference]), canvas, sigma)
 
-    def sharpness(self, H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor, sigma: float) -> Tensor:
-        """Normalized contrast of the image of warped events, blurred by sigma canvas px: -> [A]."""
-        image = normalized(draw(H_k, ink, canvas, owner), ink.weight[owner])
-        return CONTRASTS[self.contrast](blur(image, sigma))
+    def coarsely_at(self, window: Window, canvas: Canvas, sigma: float) -> View:
+        """The same for less work: under a blur of sigma px every sigma-th event will do, and pixels of sigma / 2."""
+        factor = min(1.0, 2 / sigma) if sigma else 1.0
+        return self.at(window.thinned(max(1, int(sigma))), canvas.scaled(factor), sigma * factor)
+
+    def sharpness(self, H_k: Tensor, view: View, owner: Tensor) -> Tensor:
+        """Normalized contrast of the image of warped events: H_k [A, K, 3, 3] | owner [A] -> [A]."""
+        image = normalized(draw(H_k, view.ink, view.canvas, owner), view.ink.weight[owner])
+        return CONTRASTS[self.contrast](blur(image, view.sigma))
+
+
+@dataclass(frozen=True)
+class View:
+    """Windows made ready for many warps, where they are drawn, and the blur of the image in canvas px."""
+
+    ink: Ink
+    canvas: Canvas
+    sigma: float
 
 
 def deformation(H_k: Tensor, canvas: Canvas, reference: float) -> Tensor:
@@ -81,15 +95,15 @@ def penalty(look: Look, model: Model, x: Tensor, H_k: Tensor, canvas: Canvas) ->
     return cost + look.tilt * (x[:, 6:] / model.focal).square().sum(-1) if model.free_plane else cost
 
 
-def objective(look: Look, model: Model, ink: Ink, canvas: Canvas, sigma: float, owner: Tensor) -> Objective:
-    """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the ink a row belongs to."""
+def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
+    """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to."""
 
     def evaluate(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_()
         with torch.enable_grad():
             H_k = model.homography(x, owner[rows], REFERENCES[look.reference])
-            contrast = look.sharpness(H_k, ink, canvas, owner[rows], sigma)
-            value = penalty(look, model, x, H_k, canvas) - contrast.log()
+            contrast = look.sharpness(H_k, view, owner[rows])
+            value = penalty(look, model, x, H_k, view.canvas) - contrast.log()
             (gradient,) = torch.autograd.grad(value.sum(), x)
         return value.detach(), gradient
 
