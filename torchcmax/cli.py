@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -16,12 +18,13 @@ from tqdm import tqdm
 
 from torchcmax import __version__
 from torchcmax.compensate import Compensation, compensate
-from torchcmax.config import USAGE_ERROR, Parser, command, parser
+from torchcmax.config import USAGE_ERROR, Parser, UsageError, command, parser, usage
 from torchcmax.io import DataError, DataWarning, OpenOptions, Recording, open, summary
 from torchcmax.report import Report
 from torchcmax.simulator import Simulation, write
 
 T = TypeVar("T")
+DATA_ERROR, INTERRUPTED = 1, 130
 DESCRIPTION = """Motion from event cameras by contrast maximization: warp the events of a window with a candidate motion, vote them
 into an image; the right motion is the one that makes the image sharpest."""
 RECORDING_HELP = "folder with events.txt or events.h5 and calib.txt, the same as a .zip, or an HDF5 file"
@@ -63,40 +66,27 @@ def _add_opening(command: Parser) -> None:
     command.add_class_arguments(OpenOptions, skip={"strict", "sensor", "chunk"})
 
 
-def _dataclass(kind: type[T], config: Namespace) -> T:
-    """The part of the parsed options that belongs to one dataclass."""
-    names = {f.name for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    return kind(**{name: value for name, value in vars(config).items() if name in names})
-
-
-def _opening(config: Namespace) -> OpenOptions:
-    if not config.sensor:
-        return OpenOptions(config.strict, config.camera)
-    try:
-        width, height = (int(number) for number in config.sensor.lower().split("x"))
-    except ValueError:
-        raise ValueError(f"--sensor wants width x height, like 240x180, got {config.sensor!r}") from None
-    return OpenOptions(config.strict, config.camera, (width, height))
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; the exit status is returned."""
     torch.set_num_threads(1)  # one window at a time is too little work for two: they would spin
     warnings.showwarning = _say
     top = build()
-    config = top.parse_args(arguments)
-    chosen = top.instantiate(config)[config.command]
+    config = top.parsed(arguments)
+    name, commands = config.command, {"simulate": run_simulate, "info": run_info, "compensate": run_compensate}
     try:
-        return {"simulate": run_simulate, "info": run_info, "compensate": run_compensate}[config.command](chosen)
-    except ValueError as error:  # an option that a dataclass refuses
-        print(f"torchcmax {config.command}: {error}", file=sys.stderr)
+        return commands[name](config[name])
+    except UsageError as error:
+        print(f"torchcmax {name}: {error}", file=sys.stderr)
         return USAGE_ERROR
     except DataError as error:
-        print(f"torchcmax {config.command}: {error}", file=sys.stderr)
-        return 1
+        print(f"torchcmax {name}: {error}", file=sys.stderr)
+        return DATA_ERROR
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
-        print(f"\ntorchcmax {config.command}: stopped; what was finished is kept", file=sys.stderr)
-        return 130
+        print(f"\ntorchcmax {name}: stopped{'; what was finished is kept' if name == 'compensate' else ''}", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _say(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: str | None = None) -> None:
@@ -104,15 +94,41 @@ def _say(message: Warning | str, category: type[Warning], filename: str, lineno:
         print(f"warning: {message}", file=sys.stderr)
 
 
+def _dataclass(kind: type[T], config: Namespace) -> T:
+    """The part of the parsed options that belongs to one dataclass."""
+    names = {f.name for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    with usage():
+        return kind(**{name: value for name, value in vars(config).items() if name in names})
+
+
+def _opening(config: Namespace) -> OpenOptions:
+    """How the recording is to be opened."""
+    with usage():
+        if not config.recording:
+            raise ValueError("the recording's name is empty")
+        if not config.sensor:
+            return OpenOptions(config.strict, config.camera)
+        try:
+            width, height = (int(number) for number in config.sensor.lower().split("x"))
+        except ValueError:
+            raise ValueError(f"--sensor wants width x height, like 240x180, got {config.sensor!r}") from None
+        return OpenOptions(config.strict, config.camera, (width, height))
+
+
 def run_simulate(config: Namespace) -> int:
     """torchcmax simulate"""
-    options = _dataclass(Simulation, config)
-    with tqdm(
-        total=options.duration, unit="s", desc="simulate", bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}]"
-    ) as bar:
-        write(options, Path(config.out), lambda done: bar.update(min(done, options.duration) - bar.n))
-    print(f"recording: {config.out}")
+    options, out = _dataclass(Simulation, config), _folder(config.out)
+    layout = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}]"
+    with tqdm(total=options.duration, desc="simulate", bar_format=layout) as bar, usage():  # a view past the horizon shows on the way
+        write(options, out, lambda done: bar.update(min(done, options.duration) - bar.n))
+    print(f"recording: {out}")
     return 0
+
+
+def _folder(name: str) -> Path:
+    if not name:
+        raise UsageError("--out wants the name of a folder")
+    return Path(name)
 
 
 def run_info(config: Namespace) -> int:
@@ -145,13 +161,15 @@ def about(recording: Recording) -> dict[str, str]:
 
 def run_compensate(config: Namespace) -> int:
     """torchcmax compensate"""
-    options = _dataclass(Compensation, config)
+    options, out = _dataclass(Compensation, config), _folder(config.out)
     check_device(options.device)
+    if config.images < 0:
+        raise UsageError(f"--images wants a number of at least 0, got {config.images}")
     recording = open(config.recording, _opening(config))
-    settings = {name: getattr(config, name) for name in ("recording", "strict", "camera", "sensor", "images")} | dataclasses.asdict(options)
+    settings = {name: config[name] for name in ("strict", "camera", "sensor", "images")} | dataclasses.asdict(options)
     text = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
     with (
-        Report(Path(config.out), recording, options, text, config.images) as report,
+        Report(out, recording, options, text, config.images) as report,
         tqdm(total=expected(recording, options), unit="window", desc=recording.name, disable=config.quiet) as bar,
     ):
         for window, estimate in compensate(recording, options):
@@ -168,12 +186,10 @@ def run_compensate(config: Namespace) -> int:
 
 def check_device(name: str) -> None:
     """A device that isn't there is the user's error, said before any work."""
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ValueError(f"--device wants cpu, cuda or cuda:N, got {name!r}") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: this machine has no CUDA device that torch can use; take --device cpu")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise UsageError(f"--device wants cpu, cuda or cuda:N, got {name!r}")
+    if name != "cpu" and int(name.partition(":")[2] or 0) >= torch.cuda.device_count():
+        raise UsageError(f"--device {name}: torch sees {torch.cuda.device_count()} CUDA devices on this machine; take --device cpu")
 
 
 def expected(recording: Recording, options: Compensation) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,7 +14,7 @@ from torchcmax.core.estimate import Estimate, Search, estimate
 from torchcmax.core.model import Model, Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look
 from torchcmax.core.window import Window
-from torchcmax.io import DataError, Recording
+from torchcmax.io import DataError, DataWarning, Recording
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Compensation:
             if value is not None and value < least:
                 raise ValueError(f"{name} wants a number of at least {least}, got {value}")
         given_normal(self.plane)
+        if self.model == "rotation" and self.plane != "auto":
+            raise ValueError("--plane goes with --model planar or translation: a rotation shows no plane")
         if self.model == "translation" and self.plane == "free":
             raise ValueError("--plane free goes with --model planar: a translation alone hardly tells the plane from the velocity")
 
@@ -75,6 +78,10 @@ def compensate(recording: Recording, options: Compensation | None = None) -> Ite
     batch = options.batch if left is None else min(left, options.batch)
     for window in recording.windows(options.events, options.stride, batch):
         window = window[:left].to(options.device, torch.float32)
+        at_once = window.start[window.duration <= 0]
+        if len(at_once):
+            text = f"{recording.path}: all events of the window at {at_once[0].item()} us have one time, so that no motion can be seen"
+            warnings.warn(DataWarning(text), stacklevel=2)
         yield window, estimate(window, recording.camera, motion_model(options, recording, window), options.look, options.search)
         left = None if left is None else left - len(window)
         if left == 0:
@@ -103,5 +110,6 @@ def true_normal(recording: Recording, start: Tensor) -> Tensor:
     try:
         pose = recording.truth.at(start.cpu())
     except ValueError as error:
-        raise DataError(recording.path, f"the ground truth ends before the events do: {error}", "take another --plane") from None
+        remedy = "check that groundtruth.txt and the events count time from the same moment, or take another --plane"
+        raise DataError(recording.path, f"the ground truth does not cover the events: {error}", remedy) from None
     return recording.plane.seen_from(pose).normal

@@ -5,12 +5,30 @@ from __future__ import annotations
 import difflib
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
-from jsonargparse import ActionConfigFile, ArgumentParser, set_parsing_settings
+import yaml
+from jsonargparse import ActionConfigFile, ArgumentParser, Namespace, set_parsing_settings
 
 USAGE_ERROR = 2
+NAMED = ("recording", "out")  # what is worked on is named on the command line
 CONFIG_HELP = "YAML file with any of the options below, as --print_config prints them; options behind it override it"
+
+
+class UsageError(ValueError):
+    """An option that cannot be used as it is given.  The CLI exits with 2."""
+
+
+@contextmanager
+def usage() -> Iterator[None]:
+    """A ValueError in here is about an option."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 class Parser(ArgumentParser):
@@ -18,6 +36,32 @@ class Parser(ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
+
+    def parsed(self, arguments: list[str] | None) -> Namespace:
+        """The options with their dataclasses made; whatever is wrong with them ends in `error`."""
+        try:
+            config = self.parse_args(arguments)
+            for file in config[config.command].get("config") or []:
+                self._check_keys(str(file))
+            made: Namespace = self.instantiate(config)
+        except (ValueError, TypeError, UnicodeDecodeError) as error:
+            self.error(str(error))
+        return made
+
+    def _check_keys(self, file: str) -> None:
+        """A configuration must not silently take the place of what is named on the command line."""
+        keys = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        named = [key for key in NAMED if isinstance(keys, dict) and key in keys]
+        if named:
+            self.error(f"{file}: {' and '.join(named)} belong on the command line, not into a configuration")
+
+    def dump(self, cfg: Namespace, *arguments: Any, **options: Any) -> str:
+        """What --print_config prints: a file for --config."""
+        kept = cfg.clone()
+        for name in NAMED:
+            kept.pop(name, None)
+        text: str = super().dump(kept, *arguments, **options)
+        return text
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         name = self.prog.replace(" [options]", "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ from torchcmax.io import DataError, Recording
 COLUMNS = (
     "index start_us end_us events contrast_zero contrast gain omega_x omega_y omega_z v_x v_y v_z n_x n_y n_z evaluations converged"
 ).split()
-SUMMARY = "summary.json"
+SUMMARY, PART, PICTURES = "summary.json", ".windows.csv.part", "window_*.png"
 CURVES = 5  # windows whose optimizer is shown evaluation by evaluation, of those that are pictured
 BRIGHT = 0.995  # quantile of the pixels hit that is drawn in full colour
 
@@ -48,21 +49,21 @@ def writing(path: Path) -> Iterator[Path]:
 
 
 def rows(window: Window, estimate: Estimate, first: int) -> list[dict[str, float]]:
-    """One line of windows.csv for each window, in COLUMNS; nan where the model has no such number."""
+    """One line of windows.csv for each window, in COLUMNS; nan where the model has no such number.
+
+    Times are whole µs, which float64 holds exactly for 285 years.
+    """
     normal = torch.full_like(estimate.motion.omega, torch.nan) if estimate.normal is None else estimate.normal
-    table = torch.cat(
-        [
-            torch.arange(first, first + len(window))[:, None],
-            window.start.cpu()[:, None],
-            (window.start + (window.duration.double() * 1e6).round().long()).cpu()[:, None],
-            window.weight.sum(-1, keepdim=True).cpu(),
-            *(v[:, None].cpu() for v in (estimate.contrast_zero, estimate.contrast, estimate.gain)),
-            *(v.cpu() for v in (estimate.motion.omega, estimate.motion.velocity, normal)),
-            *(v[:, None].cpu() for v in (estimate.evaluations, estimate.converged)),
-        ],
-        1,
-    )
-    return [dict(zip(COLUMNS, line, strict=True)) for line in table.double().tolist()]
+    end = window.start + (window.duration.double() * 1e6).round().long()
+    events = (window.weight > 0).sum(-1)
+    columns = [
+        *(torch.arange(first, first + len(window)), window.start, end, events),
+        *(estimate.contrast_zero, estimate.contrast, estimate.gain),
+        *(vector[:, axis] for vector in (estimate.motion.omega, estimate.motion.velocity, normal) for axis in range(3)),
+        *(estimate.evaluations, estimate.converged),
+    ]
+    table = torch.stack([column.cpu().double() for column in columns], 1)  # each by itself: together they would become float32
+    return [dict(zip(COLUMNS, line, strict=True)) for line in table.tolist()]
 
 
 def pictures(window: Window, warps: tuple[Tensor, ...], canvas: Canvas, reference: float) -> np.ndarray:
@@ -105,40 +106,44 @@ def captioned(picture: np.ndarray, text: str) -> np.ndarray:
 
 
 class Report:
-    """The folder of one run.  What is done stays, and is said to be incomplete, when the run ends before its time."""
+    """The folder of one run.  What is done stays, and is said to be incomplete, when the run ends before its time.
+
+    Nothing is written, and nothing of an earlier run is replaced, before the first window is done.
+    """
 
     def __init__(self, folder: Path, recording: Recording, options: Compensation, config: str, every: int) -> None:
         """every: a picture of each every-th window; 0: none."""
-        self.folder, self.recording, self.options, self.every = folder, recording, options, every
+        check_place(folder, recording)
+        self.folder, self.recording, self.options, self.every, self.config = folder, recording, options, every, config
         self.canvas = Canvas.around(recording.camera, options.search.margin)
         self.table: list[dict[str, float]] = []
         self.pictured = 0
         self.began = time.perf_counter()
-        self.config = config
-        try:
-            clear(folder)
-            (folder / "images").mkdir(parents=True, exist_ok=True)
-            self._csv = (folder / ".windows.csv.part").open("w", newline="")
-        except OSError as error:
-            raise DataError(folder, f"cannot be written to: {error.strerror}", "give another --out") from error
+        self.board: Board | None = None
+
+    def _begin(self) -> None:
+        clear(self.folder)
+        (self.folder / "images").mkdir(exist_ok=True)
+        self._csv = (self.folder / PART).open("w", newline="")
         self._lines = csv.writer(self._csv)
         self._lines.writerow(COLUMNS)
-        self.board = Board(folder)
-        self.board.config(config)
+        self.board = Board(self.folder)
+        self.board.config(self.config)
 
     def add(self, window: Window, estimate: Estimate) -> None:
         """A batch of windows, in the order of the recording."""
         lines = rows(window, estimate, len(self.table))
         try:
+            if self.board is None:
+                self._begin()
             self._write(lines)
             self._draw(window, estimate, lines)
         except OSError as error:
-            raise DataError(
-                self.folder, f"cannot be written to: {error.strerror}", "free some space; what was done before is kept"
-            ) from error
+            raise _unwritable(self.folder, error) from error
         self.table += lines
 
     def _write(self, lines: list[dict[str, float]]) -> None:
+        assert self.board is not None
         whole = {"index", "start_us", "end_us", "events", "evaluations", "converged"}
         for line in lines:
             values = (f"{v:.0f}" if k in whole else "" if v != v else f"{v:.9g}" for k, v in line.items())
@@ -151,7 +156,7 @@ class Report:
 
     def _draw(self, window: Window, estimate: Estimate, lines: list[dict[str, float]]) -> None:
         chosen = [i for i, line in enumerate(lines) if self.every and line["index"] % self.every == 0]
-        if not chosen:
+        if not chosen or self.board is None:
             return
         index = torch.tensor(chosen, device=window.ray.device)
         warps = at_rest(estimate.H_k[index]), estimate.H_k[index]
@@ -173,11 +178,17 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._csv.close()
-        self.board.close()
-        (self.folder / ".windows.csv.part").replace(self.folder / "windows.csv")
-        with writing(self.folder / SUMMARY) as name:
-            name.write_text(json.dumps(self.summary(None if kind is None else f"{kind.__name__}: {error}"), indent=1) + "\n")
+        if self.board is None:
+            return
+        try:
+            self.board.close()
+            self._csv.close()
+            (self.folder / PART).replace(self.folder / "windows.csv")
+            with writing(self.folder / SUMMARY) as name:
+                name.write_text(json.dumps(self.summary(None if kind is None else f"{kind.__name__}: {error}"), indent=1) + "\n")
+        except OSError as full:
+            if error is None:  # else the first error is the one to tell
+                raise _unwritable(self.folder, full) from full
 
     def summary(self, stopped: str | None = None) -> dict[str, object]:
         """The run in numbers."""
@@ -207,9 +218,36 @@ class Report:
         }
 
 
+def check_place(folder: Path, recording: Recording) -> None:
+    """The folder can be written to, is not the recording's own, and holds nothing of anybody else's that would be replaced."""
+    place, own = folder.resolve(), recording.path.resolve()
+    if place in (own, own.parent, own / "images", own.parent / "images"):
+        raise DataError(folder, "is where the recording is; pictures and tables would mix with it", "give another --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    foreign = [name for name in (SUMMARY, "windows.csv") if (folder / name).exists()]
+    if not ours(folder) and (foreign or any((folder / "images").glob(PICTURES))):
+        raise DataError(folder, f"holds {foreign[0] if foreign else PICTURES}, which no run of ours wrote", "give another --out")
+
+
+def ours(folder: Path) -> bool:
+    """Whether the folder's summary is one of ours, so that a new run may take its place."""
+    try:
+        return "torchcmax" in json.loads((folder / SUMMARY).read_text())["versions"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
 def clear(folder: Path) -> None:
     """Remove what an earlier run of ours left in the folder, and nothing else, so that old and new do not mix."""
-    if not (folder / SUMMARY).is_file():
-        return
-    for old in (*folder.glob("events.out.tfevents.*"), *(folder / "images").glob("window_*.png"), folder / "windows.csv", folder / SUMMARY):
-        old.unlink(missing_ok=True)
+    if ours(folder):
+        for old in (*folder.glob("events.out.tfevents.*"), *(folder / "images").glob(PICTURES), folder / "windows.csv", folder / SUMMARY):
+            old.unlink(missing_ok=True)
+
+
+def _unwritable(folder: Path, error: OSError) -> DataError:
+    return DataError(folder, f"cannot be written to: {error.strerror}", "free some space, or give another --out; what was done is kept")

@@ -30,7 +30,8 @@ class Search:
 
     def __post_init__(self) -> None:
         if not self.blur or min(self.blur) < 0 or self.start < 0 or self.margin < 0:
-            raise ValueError(f"a search wants at least one blur, and nothing negative, got {self}")
+            found = f"blur {self.blur}, start {self.start}, margin {self.margin}"
+            raise ValueError(f"a search wants at least one blur, and nothing negative, got {found}")
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,6 @@ def _report(window: Window, model: Model, look: Look, view: View, found: Minimum
         contrast=contrast,
         iterations=found.iterations,
         evaluations=found.evaluations,
-        converged=found.converged,
+        converged=found.converged & (window.duration > 0),
         traces=traces,
     )
