@@ -40,9 +40,8 @@ def test_the_configuration_of_a_run_makes_the_same_run_again(demo, tmp_path, cap
     assert run(capsys, "compensate", demo, *first, "--out", tmp_path / "a", "--quiet")[0] == 0
     config = json.loads((tmp_path / "a" / "summary.json").read_text())["config"]
     settings = yaml.safe_load(config)
-    recording = settings.pop("recording")
     (tmp_path / "again.yaml").write_text(yaml.safe_dump(settings))
-    assert run(capsys, "compensate", recording, "--config", tmp_path / "again.yaml", "--out", tmp_path / "b", "--quiet")[0] == 0
+    assert run(capsys, "compensate", demo, "--config", tmp_path / "again.yaml", "--out", tmp_path / "b", "--quiet")[0] == 0
     assert (tmp_path / "a" / "windows.csv").read_text() == (tmp_path / "b" / "windows.csv").read_text()
 
 
@@ -68,7 +67,10 @@ def test_info_says_what_is_there(demo, capsys):
     for word in ("240 x 180", "fx 200", "plumb_bob", "events", "Mev/s", "gaps", "poses"):
         assert word in out
     status, out, _ = run(capsys, "info", demo, "--json")
-    assert json.loads(out)["sensor"] == "240 x 180"
+    found = json.loads(out)
+    assert found["sensor"] == [240, 180]
+    assert found["count"] > 1000
+    assert found["rates"]
 
 
 def test_simulate_writes_a_recording_that_info_can_read(tmp_path, capsys):
@@ -93,6 +95,16 @@ def test_simulate_writes_a_recording_that_info_can_read(tmp_path, capsys):
         (("compensate", "R", "--out", "O", "--sensor", "240"), "--sensor wants width x height"),
         (("compensate", "R", "--out", "O", "--device", "warp9"), "--device wants cpu"),
         (("compensate", "R", "--out", "O", "--look.contrast", "sharp"), "contrast"),
+        (("compensate", "R", "--out", "O", "--device", "meta"), "--device wants cpu"),
+        (("compensate", "R", "--out", "O", "--device", "cuda:77"), "CUDA devices"),
+        (("compensate", "R", "--out", "O", "--search.blur", "[]"), "a search wants"),
+        (("compensate", "R", "--out", "O", "--search.margin", "-5"), "a search wants"),
+        (("compensate", "R", "--out", "O", "--look.guard", "-1"), "a look wants"),
+        (("compensate", "R", "--out", "O", "--search.stop.longest", "0"), "stop wants"),
+        (("compensate", "R", "--out", "O", "--images", "-1"), "--images wants"),
+        (("compensate", "R", "--out", "O", "--plane", "truth"), "--plane goes with --model planar"),
+        (("compensate", "R", "--out", ""), "--out wants the name of a folder"),
+        (("compensate", "", "--out", "O"), "the recording's name is empty"),
         (("simulate", "--out", "O", "--scene", "postr"), "poster"),
         ((), "command"),
     ],
@@ -110,6 +122,65 @@ def test_a_typo_in_a_config_file_is_named(demo, tmp_path, capsys):
     status, _, err = run(capsys, "compensate", demo, "--config", tmp_path / "c.yaml", "--out", tmp_path / "o")
     assert status == 2
     assert "did you mean look.contrast?" in err
+
+
+@pytest.mark.parametrize("text", ["look: 3\n", "just words\n", "- a\n- list\n", "events: [1, 2]\n", b"\xff\xfe\x00bad"])
+def test_a_config_of_another_form_is_wrong_usage_and_no_traceback(text, demo, tmp_path, capsys):
+    (tmp_path / "c.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    status, _, err = run(capsys, "compensate", demo, "--config", tmp_path / "c.yaml", "--out", tmp_path / "o")
+    assert status == 2
+    assert err.strip()
+
+
+def test_a_config_does_not_take_the_place_of_the_recording(demo, tmp_path, capsys):
+    (tmp_path / "c.yaml").write_text("recording: elsewhere\nevents: 5000\n")
+    status, _, err = run(capsys, "compensate", demo, "--config", tmp_path / "c.yaml", "--out", tmp_path / "o")
+    assert status == 2
+    assert "recording belong" in err
+    _, out, _ = run(capsys, "compensate", demo, "--out", tmp_path / "o", "--print_config")
+    assert not {"recording", "out"} & set(yaml.safe_load(out))
+
+
+def test_the_output_is_not_mixed_with_the_recording(tmp_path, capsys):
+    lines = "".join(f"{0.001 * i:.6f} {i % 200} {i % 100} {i % 2}\n" for i in range(300))
+    (tmp_path / "events.txt").write_text(lines)
+    (tmp_path / "calib.txt").write_text("200 200 120 90 0 0 0 0 0\n")
+    for out in (tmp_path, tmp_path / "images"):
+        status, _, err = run(capsys, "compensate", tmp_path, "--sensor", "240x180", "--events", 300, "--out", out)
+        assert status == 1
+        assert "is where the recording is" in err
+
+
+def test_a_run_that_fails_before_its_first_window_leaves_the_earlier_results(demo, tmp_path, capsys):
+    arguments = ("compensate", demo, "--out", tmp_path / "o", "--quiet", "--events")
+    assert run(capsys, *arguments, 9000)[0] == 0
+    before = {p: p.read_bytes() for p in (tmp_path / "o").rglob("*") if p.is_file()}
+    assert run(capsys, *arguments, 99_999_999)[0] == 1
+    assert {p: p.read_bytes() for p in (tmp_path / "o").rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["windows.csv", "summary.json", "images/window_00007.png"])
+def test_what_another_program_wrote_is_not_replaced(name, demo, tmp_path, capsys):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("{}")
+    (tmp_path / "events.out.tfevents.1").write_text("theirs")
+    status, _, err = run(capsys, "compensate", demo, "--out", tmp_path, "--events", 9000)
+    assert status == 1
+    assert "no run of ours wrote" in err
+    assert (tmp_path / name).read_text() == "{}"
+    assert (tmp_path / "events.out.tfevents.1").read_text() == "theirs"
+
+
+@pytest.mark.parametrize("start", [59_123_457, 1_700_000_000_000_001])
+def test_times_are_exact_to_the_microsecond_however_late(start, tmp_path, capsys):
+    stamps = [start + 7 * i for i in range(3000)]
+    lines = (f"{t // 10**6}.{t % 10**6:06d} {37 * i % 240} {53 * i % 180} {i % 2}\n" for i, t in enumerate(stamps))
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "events.txt").write_text("".join(lines))
+    (tmp_path / "rec" / "calib.txt").write_text("200 200 120 90 0 0 0 0 0\n")
+    assert run(capsys, "compensate", tmp_path / "rec", "--sensor", "240x180", "--events", 1000, "--out", tmp_path / "o")[0] == 0
+    lines = list(csv.DictReader((tmp_path / "o" / "windows.csv").open()))
+    assert [(int(line["start_us"]), int(line["end_us"])) for line in lines] == [(stamps[i], stamps[i + 999]) for i in (0, 1000, 2000)]
 
 
 @pytest.mark.parametrize("command", ["info", "compensate"])

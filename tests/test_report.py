@@ -85,8 +85,8 @@ def test_tensorboard_reads_it_back(folder):
         assert [event.step for event in board.Scalars(f"window/{name}")] == [0, 1, 2, 3]
     assert [event.step for event in board.Images("before_after")] == [0, 2]
     curves = [tag for tag in tags["scalars"] if tag.startswith("optimizer/")]
-    assert set(curves) == {f"optimizer/window_0000{i}/blur_{b}_px" for i in (0, 2) for b in (4, 2, 1)}
-    values = [event.value for event in board.Scalars("optimizer/window_00000/blur_1_px")]
+    assert set(curves) == {f"optimizer/window_0000{i}/round_{r}_blur_{b}_px" for i in (0, 2) for r, b in ((1, 4), (2, 2), (3, 1))}
+    values = [event.value for event in board.Scalars("optimizer/window_00000/round_3_blur_1_px")]
     assert values[-1] >= values[0]
     assert "config/text_summary" in tags["tensors"]
 

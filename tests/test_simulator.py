@@ -1,7 +1,9 @@
+import ast
 import dataclasses
+import inspect
 import math
-import resource
 from functools import cache
+from itertools import pairwise
 
 import h5py
 import numpy as np
@@ -13,10 +15,9 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose
 from torchcmax.core.warp import transfer
-from torchcmax.io import opening
 from torchcmax.io.errors import DataError
 from torchcmax.io.recording import Events
-from torchcmax.simulator import MOTIONS, Simulation, pose, simulate, velocity, write
+from torchcmax.simulator import LIMITS, MOTIONS, Simulation, pose, simulate, velocity, write
 from torchcmax.texture import texture
 
 SMALL = Simulation(duration=0.03, width=64, height=48, focal=55.0)
@@ -133,6 +134,11 @@ def test_a_camera_that_stands_still_sees_noise_only():
     assert abs(e.p.mean() - 0.5) < 5 * 0.5 / math.sqrt(expected)
 
 
+def test_noise_in_a_recording_is_as_frequent_as_asked():
+    e = events(Simulation(duration=0.1, speed=0.0, noise=100.0, refractory=0.0))
+    assert len(e) / (0.1 * 240 * 180) == pytest.approx(100, rel=0.03)
+
+
 def test_half_the_threshold_gives_about_twice_the_events():
     # with edges of several thresholds: where texture is fainter than that, as in the poster, it is three times
     quiet = dataclasses.replace(SMALL, scene="shapes", noise=0.0, duration=0.1)
@@ -195,17 +201,51 @@ def test_a_picture_is_a_scene(tmp_path):
         events(dataclasses.replace(SMALL, scene=str(tmp_path / "none.png")))
 
 
+@pytest.mark.parametrize("size", [(1, 3000), (3000, 1), (10, 41)])
+def test_a_picture_too_narrow_or_too_flat_is_refused(tmp_path, size):
+    from PIL import Image
+
+    Image.new("L", size).save(tmp_path / "strip.png")
+    with pytest.raises(DataError, match=r"too narrow or too flat.*\n.*4 times its shorter side"):
+        write(dataclasses.replace(SMALL, scene=str(tmp_path / "strip.png")), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_picture_too_large_is_refused(tmp_path):
+    from PIL import Image
+
+    Image.new("1", (20_000, 20_000)).save(tmp_path / "huge.png")
+    with pytest.raises(DataError, match=r"too large a picture(.|\n)*make it smaller"):
+        events(dataclasses.replace(SMALL, scene=str(tmp_path / "huge.png")))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"scene": "postre"}, "did you mean 'poster'"),
         ({"motion": "5dof"}, "did you mean '6dof'"),
         ({"scene": "panorama"}, "motion wants rotation"),
-        ({"duration": 0.0}, "duration wants a positive number, got 0"),
-        ({"distance": math.nan}, "distance wants a positive"),
-        ({"noise": -1.0}, "noise wants a number of at least 0"),
+        ({"duration": 0.0}, "duration wants 0.001 to 600 s, got 0"),
+        ({"duration": 1e-7}, "duration wants 0.001 to 600 s, got 1e-07"),
+        ({"duration": 1e9}, "duration wants 0.001 to 600 s"),
+        ({"speed": 1e6}, "speed wants 0 to 100, got 1000000"),
+        ({"distance": math.nan}, "distance wants 0.01 to 10000 m, got nan"),
+        ({"distance": 1e300}, "distance wants 0.01 to 10000 m"),
+        ({"focal": 1e9}, "focal wants 8 to 100000 px"),
+        ({"threshold": 1e-9}, "threshold wants 0.01 to 10"),
+        ({"mismatch": math.inf}, "mismatch wants 0 to 10"),
+        ({"noise": -1.0}, "noise wants 0 to 1000 Hz, got -1"),
+        ({"noise": 1e15}, "noise wants 0 to 1000 Hz, got 1000000000000000"),
+        ({"refractory": 1e300}, "refractory wants 0 to 1000 ms"),
+        ({"bandwidth": 1e-300}, "bandwidth wants 0, or 1 to 1000000 Hz"),
+        ({"seed": -1}, "seed wants 0 to"),
+        ({"seed": 2**70}, "seed wants 0 to"),
         ({"tilt": (80.0, 0.0)}, "tilt wants two angles"),
-        ({"width": 2}, "got 2 x 180"),
+        ({"tilt": (0.0, math.nan)}, "tilt wants two angles"),
+        ({"width": 2}, "width wants 8 to 2048 px, got 2"),
+        ({"height": 65535}, "height wants 8 to 2048 px, got 65535"),
+        ({"scene": "x" * 5000}, "scene wants one of"),
+        ({"scene": "a\0b"}, "scene wants one of"),
         ({"distortion": (0.1, 0.2)}, "plumb_bob wants 5"),
     ],
 )
@@ -214,55 +254,56 @@ def test_bad_options_are_named(options, message):
         Simulation(**options)
 
 
+def test_the_ends_of_the_bounds_are_possible():
+    options = Simulation(duration=0.001, speed=100, width=8, height=8, focal=20.0, noise=1000, refractory=0, bandwidth=1, threshold=0.01)
+    assert len(events(options)) > 8 * 8
+    dull = dataclasses.replace(options, speed=0, refractory=1000, bandwidth=1e6, threshold=10, mismatch=10, seed=2**63 - 1)
+    assert len(events(dull)) <= 8 * 8
+
+
+def test_every_option_says_in_a_sentence_what_it_is_and_its_bounds():
+    source = ast.parse(inspect.getsource(Simulation)).body[0].body
+    texts = {a.target.id: b.value.value for a, b in pairwise(source) if isinstance(a, ast.AnnAssign) and isinstance(b, ast.Expr)}
+    assert set(texts) == {f.name for f in dataclasses.fields(Simulation)}
+    for name, text in texts.items():
+        assert len(text.split()) > 5, name
+        assert text[0].isupper()
+        assert text.endswith(".")
+        if name in LIMITS and name != "seed":
+            least, most, unit = LIMITS[name]
+            assert f"{least} " in text
+            assert f" {most}" in text
+            assert unit.strip() in text
+
+
+def test_more_frames_than_can_be_are_refused(monkeypatch):
+    remedy = r"lower speed than .* shorter duration than .* shorter focal length than"
+    with pytest.raises(ValueError, match=remedy):
+        simulate(Simulation("panorama", "rotation", speed=100, focal=2000.0))
+    monkeypatch.setattr("torchcmax.simulator.MOST_FRAMES", 100)
+    with pytest.raises(ValueError, match=f"at most 100 can be.*{remedy}"):
+        simulate(Simulation())
+
+
+def test_a_lens_that_cannot_be_inverted_names_the_options_to_change():
+    with pytest.raises(ValueError, match=r"cannot be inverted.*weaker distortion than \(-5.0, .*focal length than 200.0 px.*240 x 180"):
+        simulate(Simulation(distortion=(-5.0, 0.0, 0.0, 0.0, 0.0)))
+
+
 def test_a_view_past_the_horizon_is_refused():
-    with pytest.raises(ValueError, match="looks past the plane's horizon"):
+    with pytest.raises(
+        ValueError, match=r"looks past the plane's horizon.*smaller tilt than .*larger distance than .*another motion than 6dof"
+    ):
         simulate(Simulation(tilt=(50.0, 0.0)))
     with pytest.raises(ValueError, match=r"at 0\.\d+ s the camera"):
         simulate(Simulation(distance=0.1))
 
 
-def test_written_files_are_the_recording(tmp_path):
-    told = []
-    folder = write(SMALL, tmp_path / "new" / "small", told.append)
-    assert sorted(p.name for p in folder.iterdir()) == sorted(
-        ["README.md", "calib.txt", "events.h5", "groundtruth.txt", "plane.txt", "texture.png", "velocity.txt"]
-    )
-    assert told == sorted(told)
-    assert told[-1] == pytest.approx(SMALL.duration, abs=2e-3)
-    back, recording = opening.open(folder), simulate(SMALL)
-    assert same(Events.join(list(back.chunks())), events(SMALL))
-    assert back.camera == recording.camera
-    torch.testing.assert_close(back.truth.pose.R, recording.truth.pose.R, rtol=0, atol=1e-9)
-    torch.testing.assert_close(back.plane.normal, recording.plane.normal)
-    table = np.loadtxt(folder / "velocity.txt")
-    motion = velocity(SMALL, torch.from_numpy(table[:, 0]))
-    np.testing.assert_allclose(table[:, 1:], torch.cat([motion.velocity, motion.omega], -1), atol=1e-8)
-    assert "* threshold: 0.25" in (folder / "README.md").read_text()
-
-
-def test_only_our_own_folder_is_replaced(tmp_path):
-    folder = write(SMALL, tmp_path / "small")
-    write(dataclasses.replace(SMALL, seed=3), folder)
-    assert "* seed: 3" in (folder / "README.md").read_text()
-    (folder / "thesis.txt").write_text("mine")
-    with pytest.raises(DataError, match="was not written by the simulator"):
-        write(SMALL, folder)
-    assert (folder / "thesis.txt").read_text() == "mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["small"]
-
-
-def test_a_place_that_cannot_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DataError, match="cannot be written"):
-        write(SMALL, tmp_path / "file" / "small")
-
-
-def test_a_full_disk_is_said_and_leaves_nothing(tmp_path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, limits[1]))
-    try:
-        with pytest.raises(DataError, match="cannot be written"):
-            write(SMALL, tmp_path / "small")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert list(tmp_path.iterdir()) == []
+def test_chunks_stay_small_however_long_and_noisy_the_recording(monkeypatch):
+    monkeypatch.setattr("torchcmax.simulator.CHUNK", 500)
+    options = dataclasses.replace(SMALL, noise=100.0)
+    chunks = list(simulate(options).chunks())
+    assert max(map(len, chunks)) < 500 + 64 * 48
+    assert len(chunks) > 5
+    monkeypatch.undo()
+    assert same(Events.join(chunks), events(options))

@@ -29,7 +29,7 @@ class Board:
 
     def curve(self, name: str, values: Tensor) -> None:
         """One number for each evaluation: values [T]."""
-        for step, value in enumerate(values.tolist()):
+        for step, value in enumerate(values[values.isfinite()].tolist()):
             self._writer.add_scalar(name, value, step)
 
     def image(self, name: str, picture: np.ndarray, step: int) -> None:

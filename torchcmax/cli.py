@@ -133,30 +133,9 @@ def _folder(name: str) -> Path:
 
 def run_info(config: Namespace) -> int:
     """torchcmax info"""
-    recording = open(config.recording, _opening(config))
-    found = summary(recording)
-    if config.json:
-        print(json.dumps({**about(recording), **dataclasses.asdict(found)}, indent=1))
-    else:
-        print("\n".join(f"{name:<13} {value}" for name, value in about(recording).items()))
-        print(found)
+    found = summary(open(config.recording, _opening(config)))
+    print(json.dumps(dataclasses.asdict(found), indent=1) if config.json else found)
     return 0
-
-
-def about(recording: Recording) -> dict[str, str]:
-    """What is known of a recording before its events are read."""
-    camera, truth, plane = recording.camera, recording.truth, recording.plane
-    height, width = camera.size
-    lens = ", ".join(f"{k:.6g}" for k in camera.distortion)
-    poses = "none" if truth is None else f"{len(truth)} poses, {truth.time[0] * 1e-6:.6f} s to {truth.time[-1] * 1e-6:.6f} s"
-    normal = None if plane is None else " ".join(f"{n:.4f}" for n in plane.normal[0].tolist())
-    return {
-        "recording": recording.name,
-        "sensor": f"{width} x {height}",
-        "calibration": f"fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g} px, {camera.model} {lens}",
-        "truth": poses,
-        "plane": "none" if plane is None else f"normal {normal}, {plane.distance[0].item():.4f} m away, in the frame of the first pose",
-    }
 
 
 def run_compensate(config: Namespace) -> int:

@@ -170,8 +170,8 @@ class Report:
                 Image.fromarray(page).save(name, format="PNG")
             self.board.image("before_after", page, number)
             if self.pictured < CURVES:
-                for blur, trace in zip(self.options.search.blur, estimate.traces, strict=True):
-                    self.board.curve(f"optimizer/window_{number:05d}/blur_{blur:g}_px", trace[i])
+                for turn, (blur, trace) in enumerate(zip(self.options.search.blur, estimate.traces, strict=True), 1):
+                    self.board.curve(f"optimizer/window_{number:05d}/round_{turn}_blur_{blur:g}_px", trace[i])
             self.pictured += 1
 
     def __enter__(self) -> Report:

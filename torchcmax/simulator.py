@@ -7,11 +7,10 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 from PIL import Image
@@ -22,13 +21,17 @@ from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose, Trajectory
 from torchcmax.io.errors import DataError
+from torchcmax.io.hdf5 import save
 from torchcmax.io.recording import Events, Recording
 from torchcmax.io.trajectory import write_plane, write_trajectory, write_velocity
+from torchcmax.sensor import Response, Sensor
 from torchcmax.texture import SCENES, texture, view
 
 STEP = 0.5  # px: no pixel moves farther between two frames
 WARM_UP = 0.03  # s before the first event, so that the sensor's filters and levels are those of a camera that has been moving
 FRAMES = 64  # rendered for one chunk of events
+CHUNK = 1 << 20  # events after which a chunk ends sooner
+BLOCK = 4096  # times looked at at once, so that the memory doesn't grow with the duration
 Waves = tuple[tuple[tuple[float, float, float], ...], ...]  # per axis x, y, z: (amplitude, frequency Hz, phase rad)
 STILL: Waves = ((), (), ())
 SHIFT: Waves = (((0.125, 0.7, 0.3), (0.035, 1.9, 1.0)), ((0.088, 0.9, 2.6), (0.031, 2.1, 0.4)), ((0.088, 0.6, 3.5), (0.025, 1.7, 2.0)))
@@ -36,15 +39,21 @@ TURN: Waves = (((0.15, 0.8, 0.4), (0.075, 2.0, 3.0)), ((0.225, 0.6, 3.3), (0.1, 
 LOOK_ROUND: Waves = (((0.25, 0.5, 2.9), (0.06, 1.6, 0.5)), ((1.60, 0.2, 0.2), (0.15, 1.1, 1.0)), ((0.20, 0.6, 1.2), (0.07, 1.9, 2.4)))
 MOTIONS = {"6dof": (SHIFT, TURN), "translation": (SHIFT, STILL), "rotation": (STILL, TURN), "slider": (STILL, STILL)}
 SLIDER = 0.3  # m/s along x
+LIMITS: dict[str, tuple[float, float, str]] = {  # of an option, both allowed: what is beyond wants years, terabytes or more than µs
+    "duration": (0.001, 600, " s"), "speed": (0, 100, ""), "distance": (0.01, 10_000, " m"), "width": (8, 2048, " px"),
+    "height": (8, 2048, " px"), "focal": (8, 100_000, " px"), "threshold": (0.01, 10, ""), "mismatch": (0, 10, ""),
+    "noise": (0, 1000, " Hz"), "refractory": (0, 1000, " ms"), "bandwidth": (1, 1_000_000, " Hz"), "seed": (0, 2**63 - 1, ""),
+}  # fmt: skip
+MOST_FRAMES = 20_000_000  # of one recording: hours of rendering
 FILES = {"README.md", "calib.txt", "events.h5", "groundtruth.txt", "plane.txt", "texture.png", "velocity.txt"}
+REMEDY = "choose another folder, or make room on the disk"
 MARK = "Simulated by torchcmax.simulator."  # in the README of a folder that may be replaced
-
-
 README = """# {name}
 
 {mark} {count} events with exact ground truth.
 
-* events.h5: events/t int64 us, sorted; events/x, events/y (column, row) raw distorted pixels; events/p 1 = brighter, 0 = darker
+* events.h5: events/t int64 us, sorted; events/x, events/y (column, row) raw distorted pixels; events/p 1 = brighter, 0 = darker;
+  with calibration, ground truth and plane, so that it can stand alone: change calib.txt and it is not looked at
 * calib.txt: fx fy cx cy k1 k2 p1 p2 k3, as OpenCV; pixel centres at integers
 * groundtruth.txt (1 kHz): t tx ty tz qx qy qz qw, camera to world, metres; x right, y down, z forward; the world is the first camera
 * velocity.txt (1 kHz): t vx vy vz wx wy wz in the camera's frame, m/s and rad/s, from the closed form of the path
@@ -63,55 +72,51 @@ class Simulation:
     """What is simulated.  The same options give the same events, byte for byte."""
 
     scene: str = "poster"
-    """poster, shapes, lines: a plane; panorama: a sphere at infinity; or the path of a picture for the plane."""
+    """What the camera sees: poster, shapes, lines: a plane; panorama: a sphere at infinity; or the path of a picture for the plane."""
     motion: str = "6dof"
-    """6dof, translation, rotation, or slider (constant velocity along x); a panorama wants rotation."""
+    """How the camera moves: 6dof, translation, rotation, or slider (constant velocity along x); a panorama wants rotation."""
     duration: float = 1.0
-    """s."""
+    """Length of the recording, s: 0.001 to 600."""
     speed: float = 1.0
-    """Times the rates of the motion, along the same path; 0 stands still."""
+    """How many times as fast as usual the camera goes along the same path: 0 (stands still) to 100."""
     tilt: tuple[float, float] = (8.0, -10.0)
-    """deg, of the plane about the first image's x and y axis."""
+    """Tilt of the plane about the first image's x and y axis, deg: each between -60 and 60."""
     distance: float = 0.8
-    """m, from the first camera to the plane along the optical axis."""
+    """Distance from the first camera to the plane along the optical axis, m: 0.01 to 10000."""
     width: int = 240
-    """px."""
+    """Width of the sensor, px: 8 to 2048."""
     height: int = 180
-    """px."""
+    """Height of the sensor, px: 8 to 2048."""
     focal: float = 200.0
-    """px."""
+    """Focal length of the lens, px: 8 to 100000."""
     distortion: tuple[float, float, float, float, float] = (-0.35, 0.13, 0.0, 0.0, 0.0)
-    """k1 k2 p1 p2 k3, as OpenCV."""
+    """Distortion of the lens, k1 k2 p1 p2 k3 as in OpenCV (no unit)."""
     threshold: float = 0.25
-    """Change of log intensity that makes an event."""
+    """Change of log intensity that makes an event: 0.01 to 10."""
     mismatch: float = 0.035
-    """Standard deviation of the pixels' thresholds."""
+    """Standard deviation of the pixels' thresholds about it, log intensity: 0 to 10."""
     noise: float = 1.0
-    """Hz per pixel: events of random polarity that mean nothing."""
+    """Rate of events of random polarity that mean nothing, Hz per pixel: 0 to 1000; those in the refractory time are not seen."""
     refractory: float = 0.5
-    """ms after an event in which its pixel is blind."""
+    """Time after an event in which its pixel is blind, ms: 0 to 1000."""
     bandwidth: float = 600.0
-    """Hz of the photoreceptor's low-pass; 0 for none."""
+    """Cut-off frequency of the photoreceptor's low-pass, Hz: 1 to 1000000, or 0 for no low-pass."""
     seed: int = 0
-    """Of the texture, the thresholds and the noise; the motion is always the same."""
+    """Seed of the random texture, thresholds and noise, 0 or more; the motion is always the same."""
 
     def __post_init__(self) -> None:
-        if self.scene not in SCENES and not Path(self.scene).is_file():
+        if self.scene not in SCENES and not os.path.isfile(self.scene):
             raise ValueError(_unknown("scene", self.scene, SCENES, ", or the path of a picture"))
         if self.motion not in MOTIONS:
             raise ValueError(_unknown("motion", self.motion, MOTIONS))
         if self.scene == "panorama" and self.motion != "rotation":
             raise ValueError(f"a panorama is infinitely far and shows rotation only: motion wants rotation, got {self.motion!r}")
-        for name in ("duration", "distance", "focal", "threshold"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} wants a positive number, got {getattr(self, name)}")
-        for name in ("speed", "mismatch", "noise", "refractory", "bandwidth", "seed"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} wants a number of at least 0, got {getattr(self, name)}")
-        if len(self.tilt) != 2 or not max(abs(a) for a in self.tilt) < 60:
+        for name, (least, most, unit) in LIMITS.items():
+            if not least <= getattr(self, name) <= most and not (name == "bandwidth" and self.bandwidth == 0):
+                zero = "0, or " if name == "bandwidth" else ""
+                raise ValueError(f"{name} wants {zero}{least} to {most}{unit}, got {getattr(self, name)}")
+        if len(self.tilt) != 2 or not all(abs(a) < 60 for a in self.tilt):
             raise ValueError(f"tilt wants two angles between -60 and 60 deg, got {self.tilt}")
-        if min(self.width, self.height) < 8 or max(self.width, self.height) > 65535:
-            raise ValueError(f"a sensor wants a width and height of 8 to 65535 px, got {self.width} x {self.height}")
         _ = self.camera  # it checks the rest
 
     @property
@@ -119,6 +124,11 @@ class Simulation:
         """With the distortion, and the principal point in the middle."""
         centre = (self.width - 1) / 2, (self.height - 1) / 2
         return Camera((self.height, self.width), self.focal, self.focal, *centre, tuple(self.distortion))
+
+    @property
+    def response(self) -> Response:
+        """What the sensor's pixels are like."""
+        return Response(self.threshold, self.mismatch, self.noise, self.refractory, self.bandwidth)
 
     @property
     def plane(self) -> Plane | None:
@@ -164,7 +174,8 @@ def velocity(options: Simulation, time: Tensor) -> Motion:
 def simulate(options: Simulation) -> Recording:
     """The recording.  Its events are rendered as they are asked for, and are the same each time."""
     milliseconds = torch.arange(math.ceil(options.duration * 1000 - 1e-9) + 1)
-    truth = Trajectory(milliseconds * 1000, pose(options, milliseconds.double() / 1000))
+    poses = [pose(options, part.double() / 1000) for part in milliseconds.split(BLOCK)]
+    truth = Trajectory(milliseconds * 1000, Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses])))
     name = f"{options.scene if options.scene in SCENES else Path(options.scene).stem}_{options.motion}"
     frames = _frame_times(options)  # now, so that what cannot be simulated is said now
     chunks = partial(_chunks, options, frames)
@@ -175,15 +186,22 @@ def _frame_times(options: Simulation) -> np.ndarray:
     """When to render: so often that no pixel moves farther than STEP, and every 2 ms at least: -> [F] int64 µs, from the warm-up on."""
     end = round(options.duration * 1e6)
     time = torch.linspace(-WARM_UP, options.duration, math.ceil((WARM_UP + options.duration) * 1000) + 1, dtype=torch.float64)
-    rate = (_pixel_speed(options, time) * 1.05 / STEP).clamp(min=500).numpy()  # frames per second; between the samples it may be more
+    fastest = torch.cat([_pixel_speed(options, part) for part in time.split(BLOCK)])
+    rate = (fastest * 1.05 / STEP).clamp(min=500).numpy()  # frames per second; between the samples it may be more
     passed = np.concatenate([[0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(time.numpy()))])
+    if rate.max() > 1e6 or passed[-1] > MOST_FRAMES:
+        raise ValueError(
+            f"pixels move at up to {fastest.max().item():.3g} px/s, which wants {passed[-1]:.3g} frames, {rate.max():.3g} in a second; "
+            f"at most {MOST_FRAMES} can be, and 1000000 in a second: take a lower speed than {options.speed}, "
+            f"a shorter duration than {options.duration} s, or a shorter focal length than {options.focal} px"
+        )
     frames = np.interp(np.linspace(0, passed[-1], math.ceil(passed[-1]) + 1), passed, time.numpy())
     return np.unique(np.append((frames * 1e6).round().astype(np.int64)[:-1], end))
 
 
 def _pixel_speed(options: Simulation, time: Tensor) -> Tensor:
     """Speed of the fastest of some sensor pixels: time [M] s -> [M] px/s."""
-    table = options.camera.rays()
+    table = _rays(options)
     y, x = (torch.linspace(1, n - 2, 9).round().long() for n in table.shape[:2])
     here = torch.meshgrid(y, x, indexing="ij")
     columns = [table[here[0], here[1] + 1] - table[here[0], here[1] - 1], table[here[0] + 1, here[1]] - table[here[0] - 1, here[1]]]
@@ -194,13 +212,25 @@ def _pixel_speed(options: Simulation, time: Tensor) -> Tensor:
         if not (near > 0.15 / options.distance).all():
             bad = time[(near <= 0.15 / options.distance).any(-1)][0].item()
             raise ValueError(
-                f"at {bad:.3f} s the camera looks past the plane's horizon or is behind it: "
-                f"take a smaller tilt {options.tilt}, a larger distance {options.distance} m or focal length {options.focal} px"
+                f"at {bad:.3f} s the camera looks past the plane's horizon or is behind it: take a smaller tilt than {options.tilt} deg, "
+                f"a larger distance than {options.distance} m, a longer focal length than {options.focal} px, "
+                f"a shorter duration than {options.duration} s, or another motion than {options.motion}"
             )
     flow = -torch.linalg.cross(motion.omega[:, None], ray[None]) - near[..., None] * motion.velocity[:, None]  # of the point, per depth
     flow = flow[..., :2] - ray[:, :2] * flow[..., 2:]
     fastest: Tensor = (to_pixels @ flow[..., None])[..., 0].norm(dim=-1).amax(-1)
     return fastest
+
+
+def _rays(options: Simulation) -> Tensor:
+    """Ray of every pixel: -> [H, W, 3].  A lens that has none is an option to change."""
+    try:
+        return options.camera.rays()
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; take a weaker distortion than {options.distortion}, a longer focal length than {options.focal} px, "
+            f"or a smaller width and height than {options.width} x {options.height} px"
+        ) from error
 
 
 def _inverse_depth(plane: Plane, at: Pose, ray: Tensor) -> Tensor:
@@ -213,113 +243,63 @@ def _inverse_depth(plane: Plane, at: Pose, ray: Tensor) -> Tensor:
 def _chunks(options: Simulation, frames: np.ndarray) -> Iterator[Events]:
     """Render the frames and let the sensor look at them: frames [F] µs -> events of FRAMES frames at a time."""
     look = view(texture(options.scene, options.seed, options.focal), options.camera, options.plane, options.distance)
-    sensor = _Sensor(options, look(pose(options, torch.from_numpy(frames[:1] * 1e-6))))
+    sensor = Sensor(options.response, options.seed, look(pose(options, torch.from_numpy(frames[:1] * 1e-6))))
+    parts: list[Events] = []
     for first in range(0, len(frames) - 1, FRAMES):
         times = frames[first : first + FRAMES + 1]
         poses = pose(options, torch.from_numpy(times * 1e-6))
-        parts = [sensor.step(look(poses[k : k + 1]), int(times[k - 1]), int(times[k])) for k in range(1, len(times))]
-        block = Events.join(parts)
-        yield block[block.t >= 0]
-
-
-@dataclass
-class _Sensor:
-    """Pixels of an event camera, flat [N]: what each remembers between frames.
-
-    A pixel compares its low-passed log intensity with the level of its last event.  Noise events do not touch that level: they
-    only start the refractory time.
-    """
-
-    options: Simulation
-    level: np.ndarray  # log intensity after the low-pass, at the last frame
-    rng: np.random.Generator = field(init=False)
-
-    def __post_init__(self) -> None:
-        options, count = self.options, len(self.level)
-        self.rng = np.random.default_rng([options.seed, 2])
-        spread = self.rng.normal(options.threshold, options.mismatch, (2, count)).clip(options.threshold / 4)
-        self.on, self.off = spread.astype(np.float32)
-        phase = self.rng.uniform(-0.99, 0.99, count).astype(np.float32)
-        self.memory = self.level + phase * np.where(phase > 0, self.off, self.on)
-        self.light = self.level
-        self.ready = np.full(count, -(2**62))  # µs from which on the pixel sees again
-        self.blind = math.ceil(options.refractory * 1000)
-
-    def step(self, light: np.ndarray, start: int, end: int) -> Events:
-        """The events between two frames, in order of time: light [N] log intensity at the end | start, end µs."""
-        level = self._low_passed(light, (end - start) * 1e-6)
-        parts = [self._noise(start, end), *self._crossings(level, start, end)]
-        self.light, self.level = light, level
-        t, pixel, p = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(t, kind="stable")
-        y, x = np.divmod(pixel[order], self.options.width)
-        return Events(t[order], x.astype(np.uint16), y.astype(np.uint16), p[order])
-
-    def _low_passed(self, light: np.ndarray, dt: float) -> np.ndarray:
-        """First-order low-pass, exact for light that changes linearly between the frames."""
-        if not self.options.bandwidth:
-            return light
-        tau = 1 / (2 * math.pi * self.options.bandwidth)
-        decay = math.exp(-dt / tau)
-        lag = (light - self.light) * np.float32(tau / dt)
-        out: np.ndarray = light - lag + (self.level - self.light + lag) * np.float32(decay)
-        return out
-
-    def _noise(self, start: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Poisson noise: t µs, pixel, polarity; what falls in a pixel's refractory time is lost."""
-        count = self.rng.poisson(self.options.noise * len(self.level) * (end - start) * 1e-6)
-        pixel, t = self.rng.integers(0, len(self.level), count), self.rng.integers(start, end, count)
-        p = self.rng.integers(0, 2, count, dtype=np.uint8)
-        pixel, first = np.unique(pixel, return_index=True)
-        seen = t[first] >= self.ready[pixel]
-        pixel, first = pixel[seen], first[seen]
-        self.ready[pixel] = t[first] + self.blind
-        return t[first], pixel, p[first]
-
-    def _crossings(self, level: np.ndarray, start: int, end: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Threshold crossings on the straight line from the last level to this one, the pixels' first, second, .. ones in turn.
-
-        A pixel that is blind when it crosses makes its event as soon as it sees, if it is still beyond the threshold then.
-        """
-        swing = np.stack([self.level, level]) - self.memory
-        pixel = np.flatnonzero((swing.max(0) >= self.on) | (swing.min(0) <= -self.off))
-        while len(pixel):
-            memory, on, off, slope = self.memory[pixel], self.on[pixel], self.off[pixel], (level - self.level)[pixel] / (end - start)
-            begin = np.maximum(self.ready[pixel], start)
-            now, last = self.level[pixel] + slope * (begin - start) - memory, level[pixel] - memory
-            early = (now >= on) | (now <= -off)
-            brighter = (now >= on) | (~early & (last >= on))
-            fire = (early | (last >= on) | (last <= -off)) & (begin <= end)
-            pixel, begin, early, brighter = pixel[fire], begin[fire], early[fire], brighter[fire]
-            target = np.where(brighter, on[fire], -off[fire])
-            wait = (target - now[fire]) / np.where(early, 1.0, slope[fire])  # a pixel that crosses late has a slope
-            t = np.where(early, begin, np.minimum(begin + wait.astype(np.int64), end))
-            self.memory[pixel] += target
-            self.ready[pixel] = t + self.blind
-            yield t, pixel, brighter.astype(np.uint8)
+        for k in range(1, len(times)):
+            t, pixel, p = sensor.step(look(poses[k : k + 1]), int(times[k - 1]), int(times[k]))
+            y, x = np.divmod(pixel, options.width)
+            parts.append(Events(t, x.astype(np.uint16), y.astype(np.uint16), p))
+            if k == len(times) - 1 or sum(map(len, parts)) >= CHUNK:
+                block, parts = Events.join(parts), []
+                yield block[block.t >= 0]
 
 
 def write(options: Simulation, folder: Path, progress: Callable[[float], None] | None = None) -> Path:
     """The recording as files, which appear all at once: events.h5, calib.txt, ground truth -> the folder.
 
-    progress is told the seconds of the recording that are done.  Only a folder that holds nothing but an earlier simulation is replaced.
+    progress is told the seconds that are done.  Only a folder with nothing but an earlier simulation is replaced; links are followed.
     """
+    target = _target(folder)  # all that can be known to go wrong is said before the work
     recording = simulate(options)
-    if folder.exists() and not _ours(folder):
-        raise DataError(folder, "exists and was not written by the simulator", "choose another folder, or remove this one")
-    partial_folder = folder.absolute().with_name(f".{folder.absolute().name}.{os.getpid()}.partial")
+    part = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
-        partial_folder.mkdir(parents=True)
-        count = _write_events(partial_folder / "events.h5", recording, progress)
-        _write_texts(partial_folder, options, recording, count)
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial_folder.rename(folder)
+        part.mkdir(parents=True)
+        count = _write_events(part / "events.h5", recording, progress)
+        _write_texts(part, options, recording, count)
+        if _target(folder).exists():  # asked again: it may have been filled meanwhile
+            shutil.rmtree(target)
+        part.rename(target)
     except OSError as error:
-        raise DataError(folder, f"cannot be written: {error}", "choose another folder, or make room on the disk") from error
+        raise DataError(folder, f"cannot be written: {error}", REMEDY) from error
+    except DataError as error:
+        if part not in error.path.parents:
+            raise
+        problem = error.problem.replace(str(part), str(folder))
+        raise DataError(folder / error.path.relative_to(part), problem, error.remedy, error.place) from error
     finally:
-        shutil.rmtree(partial_folder, ignore_errors=True)
+        shutil.rmtree(part, ignore_errors=True)
     return folder
+
+
+def _target(folder: Path) -> Path:
+    """Where the folder really is, links followed; DataError if it must not or cannot be written."""
+    try:
+        target = folder.resolve()
+        exists = target.exists()
+        near = next(parent for parent in (target.parent, *target.parents) if parent.exists())
+    except (OSError, RuntimeError, StopIteration) as error:  # a link to itself, the root
+        raise DataError(folder, f"cannot be written: {error}", REMEDY) from error
+    if exists and not _ours(target):
+        raise DataError(folder, "exists and was not written by the simulator", "choose another folder, or remove this one")
+    if exists and target.is_mount():
+        raise DataError(folder, "cannot be written: it is a mount point, which cannot be replaced", "choose a folder in it")
+    for place in (near, target) if exists else (near,):
+        if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
+            raise DataError(folder, f"cannot be written: {place} is no folder that you may write to", REMEDY)
+    return target
 
 
 def _ours(folder: Path) -> bool:
@@ -332,24 +312,18 @@ def _ours(folder: Path) -> bool:
 
 
 def _write_events(path: Path, recording: Recording, progress: Callable[[float], None] | None) -> int:
-    """Datasets that grow with every chunk: -> number of events."""
+    """events.h5, chunk by chunk: -> number of events."""
     count = 0
-    # in memory until it is whole: HDF5 crashes the process where the disk is full, a plain write says so
-    with h5py.File(path, "w", driver="core", backing_store=False) as file:
-        file.attrs.update(width=recording.camera.size[1], height=recording.camera.size[0])
-        kinds = {"t": "i8", "x": "u2", "y": "u2", "p": "u1"}
-        form = {"maxshape": (None,), "chunks": (1 << 16,), "compression": "gzip", "compression_opts": 1, "shuffle": True}
-        columns = {name: file.create_dataset(f"events/{name}", (0,), kind, **form) for name, kind in kinds.items()}
+
+    def counted() -> Iterator[Events]:
+        nonlocal count
         for chunk in recording.chunks():
-            for name, column in columns.items():
-                column.resize((count + len(chunk),))
-                column[count:] = getattr(chunk, name)
+            yield chunk
             count += len(chunk)
             if progress is not None and len(chunk):
                 progress(float(chunk.t[-1]) * 1e-6)
-        file.flush()
-        image = file.id.get_file_image()
-    path.write_bytes(image)
+
+    save(replace(recording, chunks=counted), path)
     return count
 
 
@@ -358,7 +332,9 @@ def _write_texts(folder: Path, options: Simulation, recording: Recording, count:
     assert recording.truth is not None
     write_trajectory(folder / "groundtruth.txt", recording.truth)
     time = recording.truth.time
-    write_velocity(folder / "velocity.txt", time, velocity(options, time.double() * 1e-6))
+    motions = [velocity(options, part.double() * 1e-6) for part in time.split(BLOCK)]
+    motion = Motion(torch.cat([m.omega for m in motions]), torch.cat([m.velocity for m in motions]))
+    write_velocity(folder / "velocity.txt", time, motion)
     if recording.plane is not None:
         write_plane(folder / "plane.txt", recording.plane)
     camera = recording.camera

@@ -26,6 +26,7 @@ FINEST = 700.0  # texels per unit tangent: bounds the memory for sensors with a 
 BLUR = 0.6  # px: standard deviation of the optics' point spread
 LEVELS = 3  # the plane at half, once and twice the distance the texture is made for
 EXTENT = (5.0, 4.0)  # plane distances: width and height of a plane texture; beyond it goes on mirrored
+ASPECT = 4  # of a picture, at most: a narrower one, as wide as the other textures, would fill the memory
 MARGIN = 8  # texels round each face of the sphere, so that neither blur nor interpolation sees the face's end
 CORNERS = 24  # of an outline
 LATTICE = 64  # edge of the periodic volume of random numbers
@@ -135,10 +136,15 @@ def _picture_file(path: Path, width: int) -> Tensor:
     """A picture from a file, as wide as the other plane textures, as tall as it comes: -> [H, W] intensity."""
     try:
         with Image.open(path) as image:
+            if max(image.size) > ASPECT * min(image.size):
+                problem = f"is a picture of {image.width} x {image.height} px, too narrow or too flat for a scene"
+                raise DataError(path, problem, f"crop it: its longer side may be {ASPECT} times its shorter side")
             grey = image.convert("L")
-    except OSError as error:
+    except Image.DecompressionBombError as error:
+        raise DataError(path, f"is too large a picture ({error})", f"make it smaller: {width} px of width are used") from error
+    except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises on broken files
         raise DataError(path, f"cannot be read as a picture ({error})", "give a PNG or JPEG file as the scene") from error
-    grey = grey.resize((width, max(round(grey.height * width / grey.width), 16)), Image.Resampling.LANCZOS)
+    grey = grey.resize((width, round(grey.height * width / grey.width)), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(grey, np.float32).copy()) / 255 + 0.1  # black is never without light
 
 

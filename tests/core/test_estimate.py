@@ -7,9 +7,19 @@ import torch
 from accuracy import FAST, ROTATIONS, end_point_error, from_random_starts, sample, whole
 
 from torchcmax.core.estimate import Search, estimate
-from torchcmax.core.model import MODELS, PlanarKnown, Rotation
+from torchcmax.core.model import MODELS, Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look
+from torchcmax.core.window import Window
 from torchcmax.io import open
+
+EVERY_MODEL = pytest.mark.parametrize("kind", [Rotation, Translation, PlanarKnown, Planar])
+
+
+@pytest.fixture(scope="module")
+def built_in(demo):
+    """Camera and four windows of 8,000 events of the built-in recording."""
+    recording = open(demo)
+    return recording.camera, next(recording.windows(8000, batch=4))
 
 
 @pytest.fixture
@@ -120,9 +130,83 @@ def test_without_the_guard_blurred_images_collapse_and_with_it_they_do_not(share
     assert areas[0.0].max() > math.log(4)
 
 
-def test_events_that_all_come_at_once_have_no_motion(shared):
-    camera, window = whole(shared / "data/real/ecd/shapes_rotation_2s")
-    at_once = type(window)(window.ray, 0 * window.dt, window.polarity, window.start, 0 * window.duration)
-    found = estimate(at_once, camera, Rotation(camera.fx))
+@EVERY_MODEL
+def test_events_that_all_come_at_once_have_no_motion_and_no_gain(built_in, kind):
+    camera, window = built_in
+    at_once = Window(window.ray, 0 * window.dt, window.polarity, window.start, 0 * window.duration)
+    found = estimate(at_once, camera, kind(camera.fx))
     assert (found.motion.omega == 0).all()
-    assert found.gain.isfinite().all()
+    assert (found.motion.velocity == 0).all()
+    assert (found.gain == 1).all()
+    assert not found.converged.any()
+
+
+@EVERY_MODEL
+def test_the_built_in_recording_is_sharpened_in_both_precisions(built_in, kind, dtype, device):
+    camera, window = built_in
+    found = estimate(window.to(device, dtype), camera, kind(camera.fx))
+    assert found.motion.omega.dtype == dtype
+    assert found.motion.omega.device.type == device.type
+    assert (found.gain >= 1).all()
+    assert found.converged.float().mean() >= 0.75
+    if kind is not Translation:
+        assert found.gain.mean() > 1.1
+
+
+@EVERY_MODEL
+def test_a_row_is_the_same_to_the_bit_alone_and_in_a_batch_wider_than_a_register(built_in, kind):
+    camera, _ = built_in
+    window = built_in[1][torch.arange(20) % len(built_in[1])]
+    window = Window(window.ray + 1e-3 * torch.arange(20)[:, None, None], window.dt, window.polarity, window.start, window.duration)
+    together = estimate(window, camera, kind(camera.fx))
+    for i in (0, 9, 19):
+        alone = estimate(window[i : i + 1], camera, kind(camera.fx))
+        assert torch.equal(alone.H_k[0], together.H_k[i])
+        assert alone.evaluations[0] == together.evaluations[i]
+
+
+@EVERY_MODEL
+def test_padding_changes_nothing_but_roundings(built_in, kind):
+    camera, window = built_in
+    window = window.to("cpu", torch.float64)[torch.arange(2)]
+    spare = [torch.cat([part, torch.zeros_like(part)], 1) for part in (window.ray, window.dt, window.polarity)]
+    found, padded = (estimate(w, camera, kind(camera.fx)) for w in (window, Window(*spare, window.start, window.duration)))
+    torch.testing.assert_close(padded.gain, found.gain, rtol=1e-3, atol=0)
+    torch.testing.assert_close(padded.motion.omega, found.motion.omega, rtol=0, atol=0.02)
+
+
+def test_no_windows_are_refused_by_name(built_in):
+    camera, window = built_in
+    with pytest.raises(ValueError, match="wants at least one window"):
+        estimate(window[:0], camera, Rotation(camera.fx))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"blur": ()}, {"blur": (-1.0,)}, {"blur": (1000.0, 1.0)}, {"blur": (float("nan"),)}, {"start": -1.0}, {"margin": -5.0}]
+)
+def test_searches_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match="a search wants"):
+        Search(**wrong)
+
+
+def test_some_windows_of_an_estimate_are_those_of_their_own(built_in):
+    camera, window = built_in
+    found = estimate(window, camera, Planar(camera.fx))
+    some = found[torch.tensor([2, 0])]
+    for name in ("H_k", "normal", "contrast", "contrast_zero", "evaluations", "converged", "iterations", "gain"):
+        assert torch.equal(getattr(some, name), getattr(found, name)[[2, 0]])
+    assert torch.equal(some.motion.velocity, found.motion.velocity[[2, 0]])
+    for a, b in zip(some.traces, found.traces, strict=True):
+        torch.testing.assert_close(a, b[[2, 0]], rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["poster_6dof_sim", "stop_and_go_sim", "slider_far_sim"])
+@pytest.mark.parametrize("events", [3000, 6000])
+def test_short_windows_are_never_worse_than_at_rest_and_show_planes_that_the_camera_can_see(shared, name, events):
+    recording = open(shared / "data/sim" / name)
+    window = next(recording.windows(events, (recording.count - events) // 11, 12))
+    for kind in (Planar, Translation):
+        found = estimate(window, recording.camera, kind(recording.camera.fx))
+        assert (found.gain >= 0.999).all()  # less the little that the pull of the plane may cost
+        unseen = (window.ray @ found.normal[..., None])[..., 0] > 0
+        assert (unseen.float().mean(-1) < 0.1).all()

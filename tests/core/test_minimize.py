@@ -105,8 +105,11 @@ def test_the_arguments_are_not_changed(problem):
 def test_the_trace_goes_down_and_ends_at_the_value(problem):
     A, centre = problem
     found = minimize(quadratic(A, centre), torch.zeros_like(centre), stop=EXACT)
-    assert (found.trace.diff(dim=1) <= 1e-12).all()
-    torch.testing.assert_close(found.trace[:, -1], found.value)
+    for i, trace in enumerate(found.trace):
+        own = trace[: found.evaluations[i]]
+        assert (own.diff() <= 1e-12).all()
+        assert own[-1] == found.value[i]
+        assert trace[found.evaluations[i] :].isnan().all()
 
 
 def test_no_step_is_longer_than_allowed(problem):
@@ -153,3 +156,51 @@ def test_a_wall_of_infinity_is_backed_away_from():
 
     found = minimize(log_barrier, torch.zeros(1, 1, dtype=torch.float64), stop=Stop(tolerance=1e-6))
     torch.testing.assert_close(found.x, torch.full((1, 1), 0.9, dtype=torch.float64), rtol=0, atol=1e-4)
+
+
+def test_a_wall_of_nan_is_backed_away_from_and_no_trial_leaves_the_limit():
+    tried = []
+
+    def walled(x, rows):
+        tried.append(x[0, 0].item())
+        return torch.where(x[:, 0] > 0.3, torch.nan, 0.5 * (x[:, 0] - 0.25) ** 2), torch.where(x > 0.3, torch.nan, x - 0.25)
+
+    found = minimize(walled, torch.zeros(1, 1, dtype=torch.float64), stop=Stop(tolerance=1e-6, longest=6.0))
+    torch.testing.assert_close(found.x, torch.full((1, 1), 0.25, dtype=torch.float64), rtol=0, atol=1e-4)
+    assert max(tried) <= 6.0
+
+
+@pytest.mark.parametrize("start", [1.0, 5.0, 20.0])
+def test_a_hilltop_is_left_and_not_called_converged(start):
+    """Flat slopes and concave all the way down the hill: 0.3 cos(x / 20), whose minimum is at 20 pi."""
+
+    def hill(x, rows):
+        return 0.3 * (x[:, 0] / 20).cos(), -0.3 / 20 * (x / 20).sin()
+
+    found = minimize(hill, torch.full((1, 1), start, dtype=torch.float64))
+    assert found.converged.all()
+    torch.testing.assert_close(found.x, torch.full((1, 1), 20 * torch.pi, dtype=torch.float64), rtol=0, atol=0.05)
+
+
+def test_a_wrong_curvature_is_forgotten_before_a_row_is_called_converged():
+    """After a hundredfold change of curvature the first Hessian would end the search far off."""
+
+    def bent(x, rows):
+        near = x[:, 0].abs() < 1
+        value = torch.where(near, 50 * x[:, 0] ** 2, 50 + 0.01 * (x[:, 0].abs() - 1)) + 0.01 * (x[:, 1] - 3) ** 2
+        first = torch.where(near, 100 * x[:, 0], 0.01 * x[:, 0].sign())
+        return value, torch.stack([first, 0.02 * (x[:, 1] - 3)], -1)
+
+    found = minimize(bent, torch.tensor([[9.0, -20.0]], dtype=torch.float64), stop=Stop(iterations=200))
+    torch.testing.assert_close(found.x, torch.tensor([[0.0, 3.0]], dtype=torch.float64), rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"longest": -1.0}, {"iterations": 0}, {"wolfe": 2.0}, {"armijo": 0.95}])
+def test_options_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match="stop wants"):
+        Stop(**wrong)
+
+
+def test_no_rows_are_no_work():
+    found = minimize(rosenbrock, torch.zeros(0, 2, dtype=torch.float64))
+    assert found.x.shape == (0, 2)

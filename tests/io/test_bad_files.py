@@ -1,53 +1,19 @@
 """Every file that cannot be used is named, with the place in it and what to do."""
 
+import gzip
+import os
 import struct
 import warnings
 import zipfile
 from contextlib import suppress
-from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import CALIB, GOOD, noise, read, refused
 
-from torchcmax.core.camera import Camera
-from torchcmax.io import DataError, DataWarning, Events, OpenOptions, Recording, open, save
+from torchcmax.io import DataError, DataWarning, OpenOptions, open, save
 from torchcmax.io.text import read_text
-
-CALIB = "200 200 120 90 0 0 0 0 0\n"
-GOOD = "0.000001 1 2 0\n0.000002 3 4 1\n0.000003 5 6 1\n"
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """Writes a recording as text and returns its folder."""
-
-    def write(events=GOOD, calib=CALIB):
-        (tmp_path / "events.txt").write_bytes(events.encode() if isinstance(events, str) else events)
-        if calib:
-            (tmp_path / "calib.txt").write_text(calib)
-        return tmp_path
-
-    return write
-
-
-def read(path, **options):
-    return Events.join(list(open(path, OpenOptions(**{"sensor": (240, 180), **options})).chunks()))
-
-
-def refused(path, *words, **options):
-    with pytest.raises(DataError) as caught:
-        read(path, **options)
-    for word in (*words, "what to do: "):
-        assert word in str(caught.value)
-    assert caught.value.remedy
-    return caught.value
-
-
-def test_missing_calibration(folder):
-    refused(folder(calib=""), "no calibration", "--camera pinhole", "calib.txt", "fx fy cx cy k1 k2 p1 p2 k3")
 
 
 @pytest.mark.parametrize(
@@ -64,12 +30,55 @@ def test_missing_calibration(folder):
         ("0.1 70000 3 1", "(70000, 3) is no pixel"),
         ("0.1 2 3 2", "polarity 2 is neither 0 nor 1"),
         ("1e30 2 3 1", "1e30 is no time"),
+        ("-5e12 2 3 1", "-5e12 is no time"),
         ("0.1,2,3,1", "1 columns instead of 4"),
     ],
 )
 def test_a_wrong_line_is_named_and_quoted(folder, line, words):
     error = refused(folder(f"# t x y p\n{GOOD}{line}\n{GOOD}"), words, line, "sed -i '5d'", "events.txt, line 5")
     assert error.place == "line 5"
+
+
+@pytest.mark.parametrize("first", ["t,x,y,p", "0.1,2,3,1", "1 2 3", '{"t": 1}', "0.1 2 3 7"])
+@pytest.mark.parametrize("end", ["", "\n"])
+def test_a_file_of_another_form_is_told_the_form_and_not_to_drop_lines(folder, first, end):
+    error = refused(
+        folder(f"# comment\n{first}\n{first}{end}"), "its first line is no event", first, "t x y p, separated by blanks", "line 2"
+    )
+    assert "sed" not in str(error)
+
+
+def test_a_wrong_line_in_a_zip_is_to_be_dropped_outside_of_it(tmp_path):
+    for text, place in ((GOOD + "x\n" + GOOD, "line 4"), (GOOD + "0.1", "line 4: the last line is cut off")):
+        with zipfile.ZipFile(tmp_path / "r.zip", "w") as archive:
+            archive.writestr("events.txt", text)
+            archive.writestr("calib.txt", CALIB)
+        assert "sed" not in str(refused(tmp_path / "r.zip", place, f"unpack {tmp_path / 'r.zip'}, drop the line"))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (gzip.compress(GOOD.encode()), "is compressed with gzip\n  what to do: unpack it first: gunzip"),
+        (GOOD.encode("utf-16"), "is not plain text"),
+        (GOOD.encode("utf-16-be"), "is not plain text"),
+        (b"\x7fELF\0\0", "is not plain text"),
+    ],
+)
+def test_files_that_are_no_plain_text(folder, tmp_path, data, words):
+    refused(folder(data), words, "events.txt")
+    (tmp_path / "events.txt").write_text(GOOD)
+    for name in ("calib.txt", "groundtruth.txt"):
+        (tmp_path / name).write_bytes(data)
+        refused(tmp_path, words, name)
+        (tmp_path / name).write_text(CALIB)
+
+
+def test_gzip_and_utf16_are_known_by_any_name(tmp_path):
+    (tmp_path / "events.txt.gz").write_bytes(gzip.compress(GOOD.encode()))
+    refused(tmp_path / "events.txt.gz", "gunzip < events.txt.gz")
+    (tmp_path / "my events").write_bytes(GOOD.encode("utf-16"))
+    refused(tmp_path / "my events", "iconv -f UTF-16 -t UTF-8 'my events'")
 
 
 def test_a_wrong_line_far_down_is_named(folder):
@@ -91,7 +100,14 @@ def test_a_last_line_without_its_end_is_whole_with_four_columns(folder):
 @pytest.mark.parametrize("chunk", [1, 2, 100])
 def test_an_event_off_the_sensor(folder, chunk):
     text = "# here\n\n" + GOOD + "0.000004 240 7 1\n"
-    refused(folder(text), "event 4 at pixel (240, 7)", "sensor of 240 x 180", "--sensor W H, at least 241 180", "line 6", chunk=chunk)
+    refused(
+        folder(text),
+        "event 4 at pixel (240, 7)",
+        "sensor of 240 x 180",
+        "at least --sensor 241x180, or drop the event",
+        "line 6",
+        chunk=chunk,
+    )
 
 
 UNSORTED = "0.000005 1 1 0\n0.000009 2 1 0\n0.000005 3 1 0\n0.000007 4 1 0\n0.000009 5 1 0\n"
@@ -134,7 +150,7 @@ def test_empty_files(folder, tmp_path):
 def test_a_file_of_comments_has_no_events(folder):
     path = folder("# t x y p\n")
     with pytest.raises(DataError, match="holds 0 events"):
-        next(open(path, OpenOptions(sensor=(9, 9))).windows(10))
+        next(open(path, OpenOptions(sensor=(240, 180))).windows(10))
     with pytest.raises(DataError, match="holds no events"):
         open(path)
 
@@ -146,6 +162,12 @@ def test_fewer_events_than_a_window(folder):
 
 def test_paths_that_are_no_recordings(tmp_path):
     refused(tmp_path / "nowhere", "there is no such file or folder")
+    (tmp_path / "link").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    for odd in ("/dev/null", tmp_path / "link", tmp_path / "pipe"):
+        refused(odd, "is no regular file")
+    for name in ("link", "pipe"):
+        (tmp_path / name).unlink()
     refused(tmp_path, "folder without a recording; it holds nothing", "events.txt")
     for name in ("a.png", "notes.md", "b", "c", "d"):
         (tmp_path / name).write_text("hello world\n")
@@ -153,73 +175,6 @@ def test_paths_that_are_no_recordings(tmp_path):
     refused(tmp_path / "notes.md", "is not a recording", "hello world")
     (tmp_path / "fake.h5").write_bytes(b"not hdf5 at all")
     refused(tmp_path / "fake.h5", "should be an HDF5 file and is none")
-
-
-@pytest.mark.parametrize(
-    ("calib", "words"),
-    [
-        ("200 200 120 focal", "'focal' is not a number"),
-        ("200 200 120", "holds 3 numbers"),
-        ("200 nan 120 90", "finite numbers"),
-        ("-200 200 120 90", "positive focal length"),
-        ("200 200 120 90 -9 0 0 0 0", "cannot be inverted"),
-        ("\n", "holds 0 numbers"),
-        ("model: plumb_bob\nfx: 3\n", "fy is missing"),
-        ("fx: [1\n", "is no YAML"),
-        ("focal: 3\n", "holds focal"),
-        ("{fx: a, fy: 2, cx: 3, cy: 4, width: 9, height: 9}", "not a number"),
-        ("{fx: 5, fy: 5, cx: 3, cy: 4, width: 9, height: 9, model: eye}", "'eye' is none of"),
-        ("{fx: 5, fy: 5, cx: 3, cy: 4, width: 9, height: 9, distortion: [1]}", "wants 5 distortion numbers"),
-    ],
-)
-def test_bad_calibrations(folder, calib, words):
-    refused(folder(calib=calib), words, "calib.txt")
-
-
-def test_a_calibration_or_sensor_given_wrongly(folder, tmp_path):
-    refused(folder(), "no such calibration file", camera=str(tmp_path / "none.yaml"))
-    refused(folder(), "a sensor of 0 x 5 pixels", sensor=(0, 5))
-    refused(folder("0.1 5000 3 1\n"), "beyond every known sensor", "--sensor W H", sensor=None)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda f: f.pop("events"), "has no events/t, events/x, events/y, events/p; it holds nothing"),
-        (lambda f: f["events"].pop("p"), "has no events/p; it holds events"),
-        (lambda f: f["events"].pop("x") and f.create_dataset("events/x", data=[1, 2]), "different lengths"),
-        (lambda f: f["events"].pop("t") and f.create_dataset("events/t", data=[0.1, 0.2, 0.3]), "another kind: t: float64"),
-        (lambda f: f["events"].pop("x") and f.create_dataset("events/x", data=[[1], [2], [3]]), "another kind"),
-        (lambda f: f["events"].pop("x") and f.create_dataset("events/x", data=[1, -2, 3]), "events/x is -2"),
-        (lambda f: f["events"].pop("p") and f.create_dataset("events/p", data=[1, 0, 7]), "events/p is 7"),
-        (lambda f: f.attrs.update(format="torchcmax", version=99), "newer"),
-        (lambda f: f.create_group("groundtruth"), "cannot be read as HDF5"),
-    ],
-)
-def test_bad_hdf5(folder, tmp_path, change, words):
-    folder()
-    with h5py.File(tmp_path / "e.h5", "w") as file:
-        for name, data in (("t", [1, 2, 3]), ("x", [1, 2, 3]), ("y", [1, 2, 3]), ("p", [1, 0, 1])):
-            file[f"events/{name}"] = np.array(data)
-        change(file)
-    refused(tmp_path / "e.h5", words, "e.h5")
-
-
-def noise(count=100_000):
-    rng = np.random.default_rng(0)
-    x, y = (rng.integers(0, most, count).astype("u2") for most in (240, 180))
-    events = Events(np.sort(rng.integers(0, 10**7, count)), x, y, rng.integers(0, 2, count).astype("u1"))
-    return Recording(Path("noise"), "noise", Camera.pinhole((180, 240)), lambda: iter([events]))
-
-
-def test_hdf5_cut_off_or_damaged(tmp_path):
-    save(noise(), tmp_path / "a.h5")
-    whole = (tmp_path / "a.h5").read_bytes()
-    (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
-    refused(tmp_path / "cut.h5", "cannot be read as HDF5")
-    middle = len(whole) // 2
-    (tmp_path / "bad.h5").write_bytes(whole[:middle] + bytes(b ^ 0x55 for b in whole[middle : middle + 9000]) + whole[middle + 9000 :])
-    refused(tmp_path / "bad.h5", "cannot be read as HDF5")
 
 
 def test_zip_damaged_or_without_a_recording(tmp_path):

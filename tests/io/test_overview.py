@@ -1,14 +1,19 @@
 """The summary of a recording is what counting by hand gives, however it is cut into chunks."""
 
+import dataclasses
+import json
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcmax.core.camera import Camera
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.io import DataError, Events, OpenOptions, Recording, open, summary
 
 
@@ -34,7 +39,7 @@ def test_numbers_agree_with_counting_by_hand(steps, chunk):
     np.testing.assert_allclose(found.rates, expected)
     if found.duration >= 10_000:
         assert found.peak_rate == pytest.approx(np.unique((t - t[0]) // 10_000, return_counts=True)[1].max() * 100)
-    assert str(found).startswith(f"events        {len(t)}")
+    assert f"\nevents        {len(t)}, " in str(found)
 
 
 def test_a_hot_pixel_is_named():
@@ -62,6 +67,46 @@ def test_no_events_is_an_error():
         summary(recording([], 5))
 
 
+def with_truth(first, last):
+    pose = Pose(torch.eye(3, dtype=torch.float64).expand(2, 3, 3), torch.zeros(2, 3, dtype=torch.float64))
+    plane = Plane(torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64), torch.tensor([2.5], dtype=torch.float64))
+    truth = Trajectory(torch.tensor([first, last]), pose)
+    return dataclasses.replace(recording(np.arange(100) * 1000, 7), truth=truth, plane=plane, guessed=True)
+
+
+def test_the_page_begins_with_what_is_known_and_the_json_has_it_in_numbers():
+    found = summary(with_truth(-5, 200_000))
+    assert [line.split()[0] for line in str(found).splitlines()[:6]] == ["recording", "sensor", "calibration", "truth", "plane", "events"]
+    for line in (
+        "sensor        6 x 4, guessed from the events",
+        "calibration   fx 7.2 fy 7.2 cx 2.5 cy 1.5 px, plumb_bob 0, 0, 0, 0, 0",
+        "truth         2 poses, -0.000005 s to 0.200000 s",
+        "plane         normal 0.0000 0.0000 -1.0000, distance 2.5000 m",
+    ):
+        assert line in str(found).splitlines()
+    numbers = json.loads(json.dumps(dataclasses.asdict(found)))
+    assert (numbers["recording"], numbers["sensor"], numbers["sensor_guessed"]) == ("r", [6, 4], True)
+    assert numbers["calibration"] == {"model": "plumb_bob", "fx": 1.2 * 6, "fy": 1.2 * 6, "cx": 2.5, "cy": 1.5, "distortion": [0.0] * 5}
+    assert numbers["truth"] == {"first_us": -5, "last_us": 200_000, "poses": 2}
+    assert numbers["plane"] == [0.0, 0.0, -1.0, 2.5]
+    bare = summary(recording(np.arange(90), 7))
+    assert (bare.truth, bare.plane, bare.sensor_guessed) == (None, None, False)
+    assert "truth         none\nplane         none\n" in str(bare)
+
+
+def test_a_guessed_sensor_is_a_problem():
+    assert "6 x 4, is guessed from the events" in summary(with_truth(0, 200_000)).problems[0]
+    assert not any("guessed" in problem for problem in summary(recording(np.arange(90), 7)).problems)
+
+
+@pytest.mark.parametrize(("first", "last", "covers"), [(0, 99_000, True), (1, 99_000, False), (0, 98_999, False)])
+def test_a_truth_that_does_not_cover_the_events_is_a_problem(first, last, covers):
+    told = [problem for problem in summary(with_truth(first, last)).problems if "does not cover" in problem]
+    assert len(told) == (not covers)
+    assert covers or (f"{last * 1e-6:.6f} s, the events 0.000000 s to 0.099000 s" in told[0])
+
+
 def test_a_recording_at_hand(shared):
     found = summary(open(shared / "data/real/slider_depth"))
-    assert (found.count, found.out_of_order, found.equal_times, found.problems) == (50_000, 0, 11_763, [])
+    assert (found.count, found.out_of_order, found.equal_times) == (50_000, 0, 11_763)
+    assert ["guessed" in problem or "does not cover" in problem for problem in found.problems] == [True, True]

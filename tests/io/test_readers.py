@@ -1,7 +1,6 @@
 """What is written comes back, from every form and across every border of chunks; the recordings at hand open."""
 
 import dataclasses
-import struct
 import subprocess
 import sys
 import zipfile
@@ -13,17 +12,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import ECD, POSE, a_trajectory
 
-from torchcmax.core import so3
 from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
-from torchcmax.core.pose import Motion, Pose, Trajectory
-from torchcmax.io import DataError, DataWarning, Events, OpenOptions, Recording, open, save
+from torchcmax.io import DataWarning, Events, OpenOptions, Recording, open, save
 from torchcmax.io.checked import Source, checked
 from torchcmax.io.text import read_text
-from torchcmax.io.trajectory import read_plane, read_trajectory, write_plane, write_trajectory, write_velocity
 
-ECD = "199.09 198.83 132.19 110.71 -0.3684 0.1509 -0.000296 -0.000759 0.0\n"
 DAVIS = Camera((180, 240), 199.09, 198.83, 132.19, 110.71, (-0.3684, 0.1509, -0.000296, -0.000759, 0.0))
 FISHEYE = Camera((60, 80), 40.0, 41.0, 39.5, 29.5, (0.01, -0.002, 0.0003, 0.0), "kannala_brandt")
 
@@ -147,24 +143,54 @@ def test_tabs_spaces_and_floats_that_are_whole_are_read(tmp_path):
     assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == ([1, 3, 10], [2, 4, 4], [1, 0, 1])
 
 
-def sensor_of(folder, **options):
-    height, width = open(folder, OpenOptions(**options)).camera.size
-    return width, height
+def test_a_byte_order_mark_is_passed_over(tmp_path):
+    mark = b"\xef\xbb\xbf"
+    (tmp_path / "events.txt").write_bytes(mark + b"0.1 1 2 1\n0.2 3 4 0")
+    (tmp_path / "calib.txt").write_bytes(mark + ECD.encode())
+    (tmp_path / "groundtruth.txt").write_bytes(mark + ("0" + POSE + "1" + POSE).encode())
+    recording = open(tmp_path, OpenOptions(sensor=(240, 180)))
+    assert (next(recording.chunks()).t.tolist(), recording.camera, recording.truth.time.tolist()) == ([100_000, 200_000], DAVIS, [0, 10**6])
+    (tmp_path / "other.name").write_bytes(mark + b"0.1 1 2 1\n")
+    assert len(next(open(tmp_path / "other.name", OpenOptions(sensor=(240, 180))).chunks())) == 1
+    with zipfile.ZipFile(tmp_path / "r.zip", "w") as archive:
+        for name in ("events.txt", "calib.txt"):
+            archive.write(tmp_path / name, name)
+    assert next(open(tmp_path / "r.zip", OpenOptions(sensor=(240, 180))).chunks()).x.tolist() == [1, 3]
 
 
-def test_the_sensor_is_told_by_options_then_a_picture_then_the_events(tmp_path):
-    (tmp_path / "events.txt").write_text("0.1 100 2 1\n")
-    (tmp_path / "calib.txt").write_text(ECD)
-    assert sensor_of(tmp_path) == (240, 180)
-    assert sensor_of(tmp_path, camera="pinhole") == (128, 128)
-    (tmp_path / "events.txt").write_text("0.1 300 2 1\n")
-    assert sensor_of(tmp_path) == (304, 240)
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "frame_1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + struct.pack(">II", 320, 200))
-    assert sensor_of(tmp_path) == (320, 200)
-    assert sensor_of(tmp_path, sensor=(250, 190)) == (250, 190)
-    (tmp_path / "images" / "frame_0.png").write_bytes(b"no picture")
-    assert sensor_of(tmp_path) == (304, 240)
+@pytest.mark.parametrize("first", ["-0.1 1 2 1", "+0.1 1 2 1", "1e-3 1 2 1", "# head\n.5 1 2 1"])
+def test_events_are_known_whatever_the_name(tmp_path, first):
+    (tmp_path / "events.dat").write_text(first + "\n")
+    assert len(next(open(tmp_path / "events.dat", OpenOptions(camera="pinhole", sensor=(9, 9))).chunks())) == 1
+
+
+def test_two_recordings_in_a_folder_are_told(tmp_path):
+    events = Events(np.array([1]), np.array([2], "u2"), np.array([3], "u2"), np.array([1], "u1"))
+    save(Recording(tmp_path, "a", FISHEYE, lambda: iter([events])), tmp_path / "events.h5")
+    (tmp_path / "events.txt").write_text("0.1 1 2 1\n")
+    with pytest.warns(DataWarning, match=r"holds events.h5 and events.txt; events.txt is ignored"):
+        assert open(tmp_path).camera == FISHEYE
+
+
+def test_times_up_to_the_bound_are_read_from_text_and_hdf5(tmp_path):
+    t = np.array([-(2**60), 2**60])
+    (tmp_path / "a.txt").write_text(f"{t[0] / 1e6:.0f} 1 2 1\n{t[1] / 1e6:.0f} 1 2 1\n")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, data in (("t", t), ("x", [1, 1]), ("y", [2, 2]), ("p", [1, 1])):
+            file[f"events/{name}"] = data
+    for name in ("a.txt", "a.h5"):
+        found = next(open(tmp_path / name, OpenOptions(camera="pinhole", sensor=(9, 9))).chunks()).t
+        np.testing.assert_allclose(found, t, atol=1e6)
+        assert found[1] - found[0] > 0
+
+
+def test_hdf5_attributes_may_be_arrays_of_one_number(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs.update(width=np.array([80.0]), height=np.array([60]))
+        file.create_group("calib").attrs.update(fx=np.array([50]), fy=50, cx=40, cy=30, k1=0.1)
+        for name in "txyp":
+            file[f"events/{name}"] = [1]
+    assert open(tmp_path / "a.h5").camera == Camera((60, 80), 50, 50, 40, 30, (0.1, 0, 0, 0, 0))
 
 
 def test_a_camera_file_goes_before_calib_txt(tmp_path):
@@ -179,12 +205,6 @@ def test_a_camera_file_goes_before_calib_txt(tmp_path):
     file.write_text("# fx fy cx cy\n50 50 64 64")
     assert open(tmp_path, OpenOptions(camera=str(file))).camera == Camera((128, 128), 50, 50, 64, 64)
     assert open(tmp_path, OpenOptions(camera="pinhole")).camera == Camera.pinhole((128, 128))
-
-
-def a_trajectory():
-    generator = torch.Generator().manual_seed(0)
-    w, t = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64)
-    return Trajectory(torch.tensor([-1_500_000, -1, 0, 1, 999_999, 1_468_940_293_844_896]), Pose(so3.exp(w), t))
 
 
 def test_own_files_keep_truth_plane_and_camera(tmp_path):
@@ -207,53 +227,6 @@ def test_a_recording_can_be_saved_over_itself(tmp_path):
     save(Recording(tmp_path, "a", FISHEYE, lambda: iter([events])), tmp_path / "a.h5")
     save(open(tmp_path / "a.h5", OpenOptions(chunk=2)), tmp_path / "a.h5")
     same(Events.join(list(open(tmp_path / "a.h5").chunks())), events)
-
-
-def test_trajectories_and_planes_come_back(tmp_path):
-    write_trajectory(tmp_path / "t.txt", a_trajectory())
-    found = read_trajectory(tmp_path / "t.txt")
-    assert torch.equal(found.time, a_trajectory().time)
-    torch.testing.assert_close(found.pose.t, a_trajectory().pose.t, rtol=0, atol=1e-11)
-    torch.testing.assert_close(found.pose.R, a_trajectory().pose.R, rtol=0, atol=1e-11)
-    plane = Plane(torch.tensor([[0.6, 0.0, -0.8]], dtype=torch.float64), torch.tensor([0.7], dtype=torch.float64))
-    write_plane(tmp_path / "p.txt", plane)
-    assert torch.equal(read_plane(tmp_path / "p.txt").normal, plane.normal)
-    write_velocity(tmp_path / "v.txt", torch.tensor([1_500_000]), Motion(torch.tensor([[4.0, 5, 6]]), torch.tensor([[1.0, 2, 3]])))
-    assert (tmp_path / "v.txt").read_text().splitlines()[1] == "1.500000 1 2 3 4 5 6"
-    with pytest.raises(DataError, match="cannot be written"):
-        write_plane(tmp_path / "p.txt" / "below.txt", plane)
-
-
-POSE = " 0 0 0 0 0 0 1\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("0" + POSE + "2" + POSE + "1" + POSE, "line 3: time does not increase"),
-        ("#\n0" + POSE + "0.0000004" + POSE, "line 3: time does not increase"),
-        ("0" + POSE + "1 2 3\n", "line 2: 3 columns instead of 8"),
-        ("0" + POSE + "a" + POSE, "line 2: not all are numbers"),
-        ("0" + POSE + "nan" + POSE, "line 2: a number out of all range"),
-        ("0" + POSE + "1 0 0 0 0 0 0 0\n", "line 2: .* no unit quaternion"),
-        ("0" + POSE, "holds 1 poses"),
-        ("", "holds 0 poses"),
-    ],
-)
-def test_bad_trajectories(tmp_path, text, words):
-    (tmp_path / "t.txt").write_text(text)
-    with pytest.raises(DataError, match=words):
-        read_trajectory(tmp_path / "t.txt")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [("0 0 -1", "3 columns"), ("0 0 -2 1", "no unit normal"), ("0 0 -1 -1", "positive"), ("", "0 lines")],
-)
-def test_bad_planes(tmp_path, text, words):
-    (tmp_path / "p.txt").write_text(text)
-    with pytest.raises(DataError, match=words):
-        read_plane(tmp_path / "p.txt")
 
 
 @pytest.mark.parametrize(

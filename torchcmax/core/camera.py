@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 MODELS = {"plumb_bob": 5, "kannala_brandt": 4}
+SMALLEST = 8  # px: a canvas does not become smaller
 TABLE_ERROR = 1e-3  # px: what the look-up table may be off, measured by projecting it again
 
 
@@ -42,26 +43,26 @@ class Camera:
         (height, width), focal = size, focal_by_width * size[1]
         return cls(size, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
-    def _kornia(self) -> tuple[Tensor, Tensor]:
-        """Intrinsic matrix [3, 3] and distortion coefficients, as kornia wants them."""
-        k = torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=torch.float64)
-        return k, torch.tensor(self.distortion, dtype=torch.float64)
+    def _kornia(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Intrinsic matrix [3, 3] and distortion coefficients, as kornia wants them: float64 on the device of `like`."""
+        k = like.new_tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=torch.float64)
+        return k, like.new_tensor(self.distortion, dtype=torch.float64)
 
     def project(self, ray: Tensor) -> Tensor:
         """Rays to distorted sensor pixels: ray [M, 3] -> [M, 2] px."""
         from kornia.geometry import calibration, camera  # 0.5 s, so only where it is needed
 
-        k, coefficients = self._kornia()
+        k, coefficients = self._kornia(ray)
         point = (ray[..., :2] / ray[..., 2:]).double()
         if self.model == "plumb_bob":
             pixel = point * k.diagonal()[:2] + k[:2, 2]
             return calibration.distort_points(pixel[None], k[None], coefficients[None])[0].to(ray)
-        params = torch.tensor([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=torch.float64)
+        params = ray.new_tensor([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=torch.float64)
         return camera.distort_points_kannala_brandt(point, params).to(ray)
 
     def rays(self) -> Tensor:
         """Ray (x, y, 1) of every sensor pixel, exact to 1e-3 px: -> [H, W, 3] float64, computed once per camera."""
-        return _table(self)
+        return _table(self).clone()  # the kept one stays as it is, whatever the caller does
 
 
 @lru_cache(maxsize=16)
@@ -87,7 +88,7 @@ def _undistort(camera: Camera, pixel: Tensor) -> Tensor:
     from kornia.geometry import calibration
     from kornia.geometry.camera import undistort_points_kannala_brandt
 
-    k, coefficients = camera._kornia()
+    k, coefficients = camera._kornia(pixel)
     if camera.model == "kannala_brandt":
         params = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion], dtype=torch.float64)
         return undistort_points_kannala_brandt(pixel, params)
@@ -116,7 +117,7 @@ class Canvas:
     def scaled(self, factor: float) -> Canvas:
         """The same view in a smaller image: factor 0.5 makes one pixel of two by two."""
         x, y = ((c + 0.5) * factor - 0.5 for c in self.centre)
-        height, width = (round(n * factor) for n in self.size)
+        height, width = (max(SMALLEST, round(n * factor)) for n in self.size)
         return Canvas(self.focal * factor, (x, y), (height, width))
 
     def pixels(self, ray: Tensor) -> Tensor:

@@ -32,6 +32,13 @@ class Ink:
         spare = (0, -weight.shape[-1] % ALIGNED)
         return cls(pad(basis, spare), pad(weight, spare))
 
+    def sample(self, count: int) -> Ink:
+        """`count` events of each window, evenly from its first to its last; repeated where a window has fewer."""
+        events = (self.weight != 0).sum(-1, keepdim=True)
+        index = (torch.arange(count, device=events.device) * events).div(count, rounding_mode="floor")
+        basis = self.basis.gather(-1, index[:, None].expand(-1, self.basis.shape[1], -1))
+        return Ink(basis, self.weight.gather(-1, index))
+
 
 def draw_twin(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
     """The readable twin of `draw`, in plain torch operations."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 
 import torch
@@ -13,6 +14,8 @@ from torchcmax.core.model import Displacement, Model
 from torchcmax.core.objective import REFERENCES, Look, View, metric, objective
 from torchcmax.core.pose import Motion
 from torchcmax.core.window import Window
+
+WIDEST = 32.0  # px: blur beyond it leaves nothing of an image
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,9 @@ class Search:
     """When a round ends."""
 
     def __post_init__(self) -> None:
-        if not self.blur or min(self.blur) < 0 or self.start < 0 or self.margin < 0:
+        if not (self.blur and all(0 <= blur <= WIDEST for blur in self.blur) and 0 <= self.start < math.inf and 0 <= self.margin <= 4):
             found = f"blur {self.blur}, start {self.start}, margin {self.margin}"
-            raise ValueError(f"a search wants at least one blur, and nothing negative, got {found}")
+            raise ValueError(f"a search wants blurs of 0 to {WIDEST} px, a start of at least 0 px, a margin of 0 to 4, got {found}")
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Estimate:
 
     motion [B] | normal [B, 3], None if the model has no plane | H_k [B, K, 3, 3] warp to the look's reference
     contrast_zero, contrast [B] normalized, at no motion and at this one | iterations, evaluations [B] | converged [B]
-    traces: for each round the contrast after each evaluation [B, T]
+    traces: for each round the contrast (less the guard) after each evaluation [B, T], nan after the row's last
     """
 
     motion: Motion
@@ -55,11 +58,10 @@ class Estimate:
 
     def __getitem__(self, index: Tensor) -> Estimate:
         """Some of the windows."""
-        motion = Motion(self.motion.omega[index], self.motion.velocity[index])
-        normal, traces = None if self.normal is None else self.normal[index], tuple(trace[index] for trace in self.traces)
-        numbers = (self.H_k, self.contrast_zero, self.contrast, self.iterations, self.evaluations, self.converged)
-        H_k, zero, contrast, iterations, evaluations, converged = (number[index] for number in numbers)
-        return Estimate(motion, normal, H_k, zero, contrast, iterations, evaluations, converged, traces)
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        chosen = {name: part[index] for name, part in parts.items() if isinstance(part, Tensor)}
+        motion, traces = Motion(self.motion.omega[index], self.motion.velocity[index]), tuple(trace[index] for trace in self.traces)
+        return replace(self, **chosen, motion=motion, traces=traces)
 
     @property
     def gain(self) -> Tensor:
@@ -73,15 +75,18 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
     A round begins where the last one ended: the best of the starts after the first, and before the last one both
     decompositions of a free plane.
     """
+    if not len(window):
+        raise ValueError("estimate wants at least one window, got none")
     look, search = look or Look(), search or Search()
     canvas = Canvas.around(camera, search.margin)
     x = starts(window, model, search.start)
     iterations = evaluations = torch.zeros(len(window), dtype=torch.int64, device=x.device)
     traces = []
     for index, sigma in enumerate(search.blur):
-        if model.free_plane and index == len(search.blur) - 1:
-            x = with_twins(x, model, REFERENCES[look.reference])
-        every = round_of(look, model, look.coarsely_at(window, canvas, sigma), x, search.stop)
+        view = look.coarsely_at(window, canvas, sigma)
+        if 0 < index == len(search.blur) - 1:
+            x = last_starts(look, model, view, x)
+        every = round_of(look, model, view, x, search.stop)
         iterations = iterations + every.iterations.view(len(window), -1).sum(-1)
         evaluations = evaluations + every.evaluations.view(len(window), -1).sum(-1)
         found = best_of(every, len(window))
@@ -99,10 +104,19 @@ def starts(window: Window, model: Model, far: float) -> Tensor:
     return x.repeat(len(window), 1)
 
 
-def with_twins(x: Tensor, model: Model, reference: float) -> Tensor:
-    """Each row followed by the other decomposition of its plane: x [B, P] -> [B * 2, P]."""
-    here = model.displacement(x, torch.arange(len(x), device=x.device)).seen_at(reference)
-    return torch.stack([x, model.parameters(here.twin().seen_at(-reference))], 1).flatten(0, 1)
+def last_starts(look: Look, model: Model, view: View, x: Tensor) -> Tensor:
+    """What the coarse rounds found, or rest where rest is sharper (they see fewer events); and the twin of a free plane.
+
+    x [B, P] -> [B * C, P] with C = 2 candidates for each window, of models with a free plane, or 1.
+    """
+    owner, reference = torch.arange(len(x), device=x.device), REFERENCES[look.reference]
+    with torch.no_grad():
+        here, rest = (look.sharpness(model.homography(p, owner, reference), view, owner) for p in (x, torch.zeros_like(x)))
+    x = torch.where((here > rest)[:, None], x, 0.0)
+    if not model.free_plane:
+        return x
+    twin = model.displacement(x, owner).seen_at(reference).twin().seen_at(-reference)
+    return torch.stack([x, model.parameters(twin)], 1).flatten(0, 1)
 
 
 def round_of(look: Look, model: Model, view: View, x: Tensor, stop: Stop | None = None) -> Minimum:
@@ -128,10 +142,11 @@ def rates(displacement: Displacement, window: Window) -> Motion:
 def _report(window: Window, model: Model, look: Look, view: View, found: Minimum, traces: tuple[Tensor, ...]) -> Estimate:
     """The last minimum of every window, in units that people read, with the contrast that all its events have."""
     owner = torch.arange(len(window), device=found.x.device)
+    x = torch.where((window.duration > 0)[:, None], found.x, 0.0)  # events that come all at once show no motion
     with torch.no_grad():
-        H_k, H_zero = (model.homography(x, owner, REFERENCES[look.reference]) for x in (found.x, torch.zeros_like(found.x)))
+        H_k, H_zero = (model.homography(p, owner, REFERENCES[look.reference]) for p in (x, torch.zeros_like(x)))
         contrast, zero = (look.sharpness(H, view, owner) for H in (H_k, H_zero))
-        displacement = model.displacement(found.x, owner)
+        displacement = model.displacement(x, owner)
     return Estimate(
         motion=rates(displacement, window),
         normal=displacement.normal if model.has_plane else None,

@@ -29,12 +29,16 @@ class Stop:
     wolfe: float = 0.9
     """Share of the slope that may be left after a step."""
 
+    def __post_init__(self) -> None:
+        if not (self.tolerance > 0 and self.longest > 0 and min(self.iterations, self.trials) >= 1 and 0 < self.armijo < self.wolfe < 1):
+            raise ValueError(f"stop wants a tolerance, lengths and counts above 0, and 0 < armijo < wolfe < 1, got {self}")
+
 
 @dataclass(frozen=True)
 class Minimum:
     """Where each row ended: x [B, P] | value [B] | iterations, evaluations [B] int | converged [B] bool | trace [B, T].
 
-    trace holds the value after every round of evaluations; the last value stays when a row is done before the others.
+    trace holds the lowest value after each evaluation, nan after the row's own last one.
     """
 
     x: Tensor
@@ -43,6 +47,62 @@ class Minimum:
     evaluations: Tensor
     converged: Tensor
     trace: Tensor
+
+
+class _Rows:
+    """The state of every row: its point, its curvature, and the bracket of its line search."""
+
+    def __init__(self, x: Tensor, value: Tensor, gradient: Tensor, metric: Tensor, stop: Stop) -> None:
+        self.x, self.value, self.gradient, self.metric, self.stop = x.clone(), value, gradient, metric, stop
+        self.plain = torch.linalg.inv(metric)  # inverse Hessian as long as nothing is known of the curvature
+        self.inverse = self.plain.clone()
+        self.step = torch.zeros_like(x)
+        self.length, self.limit, self.low, self.high = (torch.zeros_like(value) for _ in range(4))
+        self.iterations, self.trials = (torch.zeros_like(value, dtype=torch.int64) for _ in range(2))
+        self.evaluations = torch.ones_like(self.trials)
+        self.scaled, self.converged = torch.zeros_like(value, dtype=torch.bool), gradient.abs().amax(-1) == 0
+        self.done = self.converged | ~value.isfinite()
+        self.aim(torch.arange(len(x), device=x.device))
+
+    def aim(self, rows: Tensor) -> None:
+        """A new step for these rows and the length of it to try first: all of it, or one px while the scale is not known."""
+        step = -(self.inverse[rows] @ self.gradient[rows][..., None])[..., 0]
+        limit = self.stop.longest / _norm(step, self.metric[rows]).clamp_min(torch.finfo(step.dtype).tiny)
+        self.step[rows], self.limit[rows] = step, limit
+        self.length[rows] = torch.where(self.scaled[rows], limit.clamp_max(1.0), limit / max(1.0, self.stop.longest))
+        self.low[rows], self.high[rows], self.trials[rows] = 0, torch.inf, 0
+
+    def accept(self, rows: Tensor, x: Tensor, value: Tensor, gradient: Tensor) -> None:
+        """The step was good: learn the curvature from it, and aim again."""
+        self.inverse[rows], usable = _update(self.inverse[rows], x - self.x[rows], gradient - self.gradient[rows], ~self.scaled[rows])
+        self.x[rows], self.value[rows], self.gradient[rows] = x, value, gradient
+        self.scaled[rows] = self.scaled[rows] | usable
+        self.iterations[rows] += 1
+        self.aim(rows)
+
+    def shrink(self, rows: Tensor, guess: Tensor, too_long: Tensor) -> None:
+        """The length was wrong: narrow the bracket, and try the guess, kept off its ends, or twice as far while it is open."""
+        length = self.length[rows]
+        self.low[rows] = torch.where(too_long, self.low[rows], length)
+        self.high[rows] = torch.where(too_long, length, self.high[rows])
+        low, high = self.low[rows], self.high[rows]
+        share = ((guess - low) / (high - low)).nan_to_num(0.0).clamp(0.1, 0.5)
+        closed = low + share * torch.where(high.isinf(), 0.0, high - low)
+        self.length[rows] = torch.where(high.isinf(), torch.minimum(2 * length, self.limit[rows]), closed)
+        self.trials[rows] += 1
+
+    def judge(self, rows: Tensor) -> None:
+        """Which rows are done: the full step is shorter than the tolerance, or so is the bracket along their own gradient."""
+        tolerance, norm = self.stop.tolerance, _norm(self.step[rows], self.metric[rows])
+        fresh = self.trials[rows] == 0
+        small = fresh & self.scaled[rows] & (self.length[rows] * norm < tolerance)
+        stuck = ~fresh & (self.high[rows] * norm < tolerance)
+        again = rows[stuck & self.scaled[rows]]  # perhaps the curvature was wrong: once more without it
+        self.inverse[again], self.scaled[again] = self.plain[again], False
+        self.aim(again)
+        self.converged[rows] = small | (stuck & ~torch.isin(rows, again))
+        spent = (self.iterations[rows] >= self.stop.iterations) | (self.trials[rows] >= self.stop.trials)
+        self.done[rows] = self.converged[rows] | spent
 
 
 def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop: Stop | None = None) -> Minimum:
@@ -54,51 +114,25 @@ def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop
     Line search by bracketing to the weak Wolfe conditions (Nocedal & Wright, Numerical Optimization, ch. 3 and 6).
     """
     stop = stop or Stop()
-    batch, size = x.shape
-    metric = torch.eye(size).to(x).expand(batch, -1, -1) if metric is None else metric
-    everyone = torch.arange(batch, device=x.device)
-    x, (value, gradient) = x.clone(), objective(x, everyone)
-    inverse = torch.linalg.inv(metric)
-    step, _, limit = _aim(gradient, inverse, metric, stop)
-    length = limit / stop.longest  # the scale is not known yet: try one pixel
-    low, high = torch.zeros_like(value), torch.full_like(value, torch.inf)
-    iterations, evaluations, trials = torch.zeros_like(everyone), torch.ones_like(everyone), torch.zeros_like(everyone)
-    converged = gradient.abs().amax(-1) == 0
-    done, trace = converged | ~value.isfinite(), [value.clone()]
-
-    while not done.all():
-        rows = (~done).nonzero()[:, 0]
-        d, a, f, g, m = step[rows], length[rows], value[rows], gradient[rows], metric[rows]
-        trial = x[rows] + a[:, None] * d
-        f_new, g_new = objective(trial, rows)
-        evaluations[rows] += 1
-        slope, slope_new = (g * d).sum(-1), (g_new * d).sum(-1)
-        slack = 4 * torch.finfo(x.dtype).eps * f.abs()
-        too_long = ~(f_new <= f + stop.armijo * a * slope + slack)  # also where f_new is nan
-        too_short = ~too_long & (slope_new < stop.wolfe * slope) & (a < limit[rows])
-        good = ~too_long & ~too_short
-
-        took = rows[good]
-        first = iterations[took] == 0
-        inverse[took] = _update(inverse[took], a[good, None] * d[good], g_new[good] - g[good], first)
-        x[took], value[took], gradient[took] = trial[good], f_new[good], g_new[good]
-        step[took], length[took], limit[took] = _aim(gradient[took], inverse[took], metric[took], stop)
-        low[took], high[took], trials[took] = 0, torch.inf, 0
-        iterations[took] += 1
-
-        again = rows[~good]
-        low[again] = torch.where(too_short, a, low[rows])[~good]
-        high[again] = torch.where(too_long, a, high[rows])[~good]
-        parabola = -slope * a * a / (2 * (f_new - f - slope * a))  # lowest point through f, slope and f_new
-        length[again] = _between(parabola[~good], low[again], high[again], limit[again])
-        trials[again] += 1
-
-        reach = torch.where(good, length[rows], high[rows]) * _norm(step[rows], m)
-        converged[rows] = reach < stop.tolerance
-        spent = (iterations[rows] >= stop.iterations) | (trials[rows] >= stop.trials)
-        done[rows] = converged[rows] | spent
-        trace.append(value.clone())
-    return Minimum(x, value, iterations, evaluations, converged, torch.stack(trace, 1))
+    metric = torch.eye(x.shape[-1]).to(x).expand(len(x), -1, -1) if metric is None else metric
+    state = _Rows(x, *objective(x, torch.arange(len(x), device=x.device)), metric, stop)
+    trace = [state.value.clone()]
+    while not state.done.all():
+        rows = (~state.done).nonzero()[:, 0]
+        length, step, value = state.length[rows], state.step[rows], state.value[rows]
+        x_new = state.x[rows] + length[:, None] * step
+        value_new, gradient_new = objective(x_new, rows)
+        state.evaluations[rows] += 1
+        slope, slope_new = (state.gradient[rows] * step).sum(-1), (gradient_new * step).sum(-1)
+        slack = 4 * torch.finfo(x.dtype).eps * value.abs()
+        too_long = ~(value_new <= value + stop.armijo * length * slope + slack)  # also where it is nan
+        good = ~too_long & ~((slope_new < stop.wolfe * slope) & (length < state.limit[rows]))  # else it is too short
+        parabola = -slope * length * length / (2 * (value_new - value - slope * length))  # through both values and the slope
+        state.accept(rows[good], x_new[good], value_new[good], gradient_new[good])
+        state.shrink(rows[~good], parabola[~good], too_long[~good])
+        state.judge(rows)
+        trace.append(torch.full_like(state.value, torch.nan).index_copy(0, rows, state.value[rows]))
+    return Minimum(state.x, state.value, state.iterations, state.evaluations, state.converged, torch.stack(trace, 1))
 
 
 def _norm(step: Tensor, metric: Tensor) -> Tensor:
@@ -106,30 +140,17 @@ def _norm(step: Tensor, metric: Tensor) -> Tensor:
     return (step[:, None] @ metric @ step[:, :, None])[:, 0, 0].clamp_min(0).sqrt()
 
 
-def _aim(gradient: Tensor, inverse: Tensor, metric: Tensor, stop: Stop) -> tuple[Tensor, Tensor, Tensor]:
-    """The quasi-Newton step, the length of it to try first, and the length never to pass."""
-    step = -(inverse @ gradient[..., None])[..., 0]
-    limit = stop.longest / _norm(step, metric).clamp_min(torch.finfo(step.dtype).tiny)
-    return step, limit.clamp_max(1.0), limit
+def _update(inverse: Tensor, s: Tensor, y: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+    """BFGS update (6.17) of the inverse Hessian [B, P, P] by step s and change of gradient y [B, P], and where there was one.
 
-
-def _between(guess: Tensor, low: Tensor, high: Tensor, limit: Tensor) -> Tensor:
-    """The next length to try: the guess, kept off the ends of the bracket; twice the last while there is no upper end."""
-    bracketed = low + torch.minimum(torch.maximum((guess - low) / (high - low), guess.new_tensor(0.1)), guess.new_tensor(0.5)) * (
-        high - low
-    )
-    return torch.where(high.isinf(), torch.minimum(2 * low, limit), bracketed.nan_to_num(0.5))
-
-
-def _update(inverse: Tensor, s: Tensor, y: Tensor, first: Tensor) -> Tensor:
-    """BFGS update (6.17) of the inverse Hessian [B, P, P] by step s and change of gradient y [B, P]; none where s.y <= 0."""
+    Nothing is learned where s.y <= 0; the first time the scale is set too, (6.20).
+    """
     sy = (s * y).sum(-1)
     yHy = (y[:, None] @ inverse @ y[:, :, None])[:, 0, 0]
     usable = (sy > 0) & (yHy > 0)
-    scale = torch.where(first & usable, sy / torch.where(usable, yHy, 1.0), 1.0)  # (6.20): the first step sets the scale
+    scale = torch.where(first & usable, sy / torch.where(usable, yHy, 1.0), 1.0)
     inverse = inverse * scale[:, None, None]
     rho = torch.where(usable, 1 / torch.where(usable, sy, 1.0), 0.0)[:, None, None]
-    eye = torch.eye(s.shape[-1]).to(s)
-    left = eye - rho * s[:, :, None] * y[:, None]
+    left = torch.eye(s.shape[-1]).to(s) - rho * s[:, :, None] * y[:, None]
     updated = left @ inverse @ left.mT + rho * s[:, :, None] * s[:, None]
-    return torch.where(usable[:, None, None], updated, inverse)
+    return torch.where(usable[:, None, None], updated, inverse), usable

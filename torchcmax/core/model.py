@@ -12,6 +12,8 @@ from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.warp import TERMS, polynomial
 
+CLOSEST = 0.02  # plane distances that a camera can come near its plane; nearer is nonsense that the guard punishes
+
 
 @dataclass(frozen=True)
 class Displacement:
@@ -30,8 +32,12 @@ class Displacement:
         The velocity is constant in one frame and so in the other; the plane turns and comes nearer, as in `Plane.seen_from`.
         """
         R_t = so3.exp(-phase * self.turn)  # of the reference, seen from the new frame
-        distance = 1 + phase * (self.shift * self.normal).sum(-1, keepdim=True)
+        distance = (1 + phase * (self.shift * self.normal).sum(-1, keepdim=True)).clamp_min(CLOSEST)
         return Displacement(self.turn, (R_t @ self.shift[..., None])[..., 0] / distance, (R_t @ self.normal[..., None])[..., 0])
+
+    def homography(self) -> Tensor:
+        """H_k [A, K, 3, 3] of the warp to the reference camera; its s is the share of the window since the reference."""
+        return polynomial(self.turn, self.shift, self.normal, TERMS)
 
     def twin(self) -> Displacement:
         """The other motion and plane with the same image motion: velocity and normal change places.
@@ -65,10 +71,13 @@ class Model:
         """The motion in the frame of the camera at the window's first event."""
         raise NotImplementedError
 
+    def at_reference(self, x: Tensor, owner: Tensor, reference: float) -> Displacement:
+        """The same motion in the frame of the camera at `reference`, a share of the window."""
+        return self.displacement(x, owner).seen_at(reference)
+
     def homography(self, x: Tensor, owner: Tensor, reference: float) -> Tensor:
-        """H_k [A, K, 3, 3] of the warp to the camera at `reference`, a share of the window; s is counted from there."""
-        there = self.displacement(x, owner).seen_at(reference)
-        return polynomial(there.turn, there.shift, there.normal, TERMS)
+        """H_k [A, K, 3, 3] of the warp to the camera at `reference`."""
+        return self.at_reference(x, owner, reference).homography()
 
     def parameters(self, displacement: Displacement) -> Tensor:
         """The x that `displacement` gives back as this motion, as far as the model has it: [A, P]."""
@@ -87,9 +96,8 @@ class Rotation(Model):
     def displacement(self, x: Tensor, owner: Tensor) -> Displacement:
         return Displacement(x / self.focal, torch.zeros_like(x), self._wall(x, owner))
 
-    def homography(self, x: Tensor, owner: Tensor, reference: float) -> Tensor:
-        here = self.displacement(x, owner)  # a turn is the same in the frame of every moment
-        return polynomial(here.turn, here.shift, here.normal, TERMS)
+    def at_reference(self, x: Tensor, owner: Tensor, reference: float) -> Displacement:
+        return self.displacement(x, owner)  # a turn is the same in the frame of every moment
 
     def parameters(self, displacement: Displacement) -> Tensor:
         return displacement.turn * self.focal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,12 +13,14 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.contrast import CONTRASTS, blur, normalized
 from torchcmax.core.draw import NEAREST, Ink, draw
 from torchcmax.core.minimize import Objective
-from torchcmax.core.model import Model
+from torchcmax.core.model import Displacement, Model
 from torchcmax.core.window import Window
 
 REFERENCES = {"first": 0.0, "middle": 0.5}
 ContrastName = Literal["variance", "mean_square", "high_pass", "michelson", "gradient_magnitude"]
-SAMPLES = 150  # events that are enough to measure how far a step moves a window
+SAMPLES = 150  # events that are enough to measure how far a step moves a window, and to watch over it
+RIDGE = 1e-3  # of the metric, as a share of its mean
+GRAZING = 0.05  # sine of the flattest angle at which an event can see its plane
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,9 @@ class Look:
         for value, names in ((self.contrast, CONTRASTS), (self.polarity, ("dropped", "signed")), (self.reference, REFERENCES)):
             if value not in names:
                 raise ValueError(f"{value!r} is none of {', '.join(names)}")
+        if not (self.deformation > 1 and 0 <= self.guard < math.inf and 0 <= self.tilt < math.inf):
+            found = f"deformation {self.deformation}, guard {self.guard}, tilt {self.tilt}"
+            raise ValueError(f"a look wants a deformation above 1 and weights of at least 0, got {found}")
 
     def at(self, window: Window, canvas: Canvas, sigma: float) -> View:
         """All events of the window on the canvas, blurred by sigma px."""
@@ -67,64 +73,68 @@ class View:
     sigma: float
 
 
-def deformation(H_k: Tensor, canvas: Canvas, reference: float) -> Tensor:
-    """By how much the warp changes areas: log |det| of its Jacobian in five places at both ends of the window, -> [A, 10].
+def deformation(there: Displacement, H_k: Tensor, ray: Tensor, reference: float) -> Tensor:
+    """By how much the warp changes areas: log |det| of its Jacobian at rays [A, 3, M] at both ends of the window, -> [A, 2M].
 
     0 where areas stay; events can only collapse into a line or a point where it goes to minus infinity (Shiba et al. 2022).
+    The Jacobian of x -> H x / (H x)_z has the determinant det H / (H x)_z^3, and det H is the square of the distance to the plane.
     """
-    x, y = canvas.centre
-    left, right, up, down = (v / canvas.focal for v in (-x / 2, (canvas.size[1] - x) / 2, -y / 2, (canvas.size[0] - y) / 2))
-    places = [[0, 0, 1], [left, up, 1], [right, up, 1], [left, down, 1], [right, down, 1]]
-    ray = H_k.new_tensor(places).mT
     logs = []
     for end in (-reference, 1 - reference):
-        powers = H_k.new_tensor([end**k for k in range(H_k.shape[1])])
-        H = (H_k * powers[:, None, None]).sum(1)
-        depth = (H[:, 2:] @ ray)[:, 0].clamp_min(NEAREST)
-        determinant = torch.linalg.det(H).abs().clamp_min(NEAREST**3)[:, None]
-        logs.append(determinant.log() - 3 * depth.log())  # of x -> H x / (H x)_z
+        distance = 1 + end * (there.normal * there.shift).sum(-1, keepdim=True)  # below zero the camera is behind the plane
+        H = (H_k * H_k.new_tensor([end**k for k in range(H_k.shape[1])])[:, None, None]).sum(1)
+        depth = (H[:, 2, :, None] * ray).sum(1)
+        logs.append(2 * distance.clamp_min(NEAREST).log() - 3 * depth.clamp_min(NEAREST).log())
     return torch.cat(logs, 1)
 
 
-def penalty(look: Look, model: Model, x: Tensor, H_k: Tensor, canvas: Canvas) -> Tensor:
-    """The guard: nothing until areas change by more than look.deformation; and a weak pull of a free plane to face the camera."""
+def penalty(look: Look, model: Model, there: Displacement, H_k: Tensor, ray: Tensor) -> Tensor:
+    """The guard, at rays [A, 3, M] of some events: nothing until areas change by more than look.deformation, -> [A].
+
+    A free plane must face all the events, which it cannot have shown otherwise, and is pulled weakly towards the camera.
+    """
     if not model.has_plane:  # a turn cannot collapse anything
-        return torch.zeros_like(x[:, 0])
-    excess = deformation(H_k, canvas, REFERENCES[look.reference]).abs() - torch.tensor(look.deformation).log().item()
+        return torch.zeros_like(there.turn[:, 0])
+    excess = deformation(there, H_k, ray, REFERENCES[look.reference]).abs() - math.log(look.deformation)
     cost = look.guard * excess.clamp_min(0).square().mean(-1)
-    return cost + look.tilt * (x[:, 6:] / model.focal).square().sum(-1) if model.free_plane else cost
+    if not model.free_plane:
+        return cost
+    away = ((there.normal[:, :, None] * ray).sum(1).amax(-1) + GRAZING).clamp_min(0)
+    tilted = 2 * (1 + there.normal[:, 2])  # the square of a small tilt
+    return cost + look.guard * away.square() + look.tilt * tilted
 
 
 def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
     """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to."""
+    ray = view.ink.sample(SAMPLES).basis[:, :3]
 
     def evaluate(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_()
         with torch.enable_grad():
-            H_k = model.homography(x, owner[rows], REFERENCES[look.reference])
+            there = model.at_reference(x, owner[rows], REFERENCES[look.reference])
+            H_k = there.homography()
             contrast = look.sharpness(H_k, view, owner[rows])
-            value = penalty(look, model, x, H_k, view.canvas) - contrast.log()
+            value = penalty(look, model, there, H_k, ray[owner[rows]]) - contrast.log()
             (gradient,) = torch.autograd.grad(value.sum(), x)
         return value.detach(), gradient
 
     return evaluate
 
 
-def metric(look: Look, model: Model, ink: Ink, x: Tensor, owner: Tensor, ridge: float = 1e-3) -> Tensor:
+def metric(look: Look, model: Model, ink: Ink, x: Tensor, owner: Tensor) -> Tensor:
     """Squared length of a step in px of the events' own flow: mean of J^T J over some events, J = d pixel / d x, -> [A, P, P].
 
-    In it one unit moves the events by 1 px rms, and rotation and translation, nearly collinear, come apart. The ridge, a
-    share of the mean, gives a length to what moves nothing (the tilt of a plane before which nothing moves yet).
+    In it one unit moves the events by 1 px rms, and rotation and translation, nearly collinear, come apart. The ridge gives a
+    length to what moves nothing (the tilt of a plane before which nothing moves yet).
     """
-    parameters, every = x.shape[-1], max(1, ink.basis.shape[-1] // SAMPLES)
-    basis, weight = ink.basis[..., ::every][owner], ink.weight[..., ::every][owner].abs()
+    parameters, some = x.shape[-1], ink.sample(SAMPLES)
     steps = torch.eye(parameters).to(x)
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
-    H_k = model.homography(nearby, owner.repeat_interleave(2 * parameters), REFERENCES[look.reference])
-    flat, basis = H_k.transpose(1, 2).flatten(2), basis.repeat_interleave(2 * parameters, 0)
-    ray = (flat[..., None] * basis[:, None]).sum(2)  # no matrix products here, which round differently in another batch
+    each = owner.repeat_interleave(2 * parameters)
+    flat = model.homography(nearby, each, REFERENCES[look.reference]).transpose(1, 2).flatten(2)
+    ray = (flat[..., None] * some.basis[each][:, None]).sum(2)  # no matrix products here, which round differently in another batch
     flow = (ray[:, :2] / ray[:, 2:].clamp_min(NEAREST) * model.focal).view(len(x), 2, parameters, -1)
-    J = (flow[:, 0] - flow[:, 1]) / 2 * weight[:, None].repeat(1, 1, 2)
-    G = (J[:, :, None] * J[:, None]).sum(-1) / weight.sum(-1).clamp_min(1)[:, None, None]
+    J = (flow[:, 0] - flow[:, 1]) / 2 * (some.weight[owner] != 0).to(x)[:, None].repeat(1, 1, 2)
+    G = (J[:, :, None] * J[:, None]).sum(-1) / SAMPLES
     mean = G.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(x.dtype).eps)
-    return G + ridge * mean[:, None, None] * torch.eye(parameters).to(x)
+    return G + RIDGE * mean[:, None, None] * torch.eye(parameters).to(x)

@@ -29,11 +29,11 @@ class Plane:
 
     def tilt(self) -> Tensor:
         """The two angles that `tilted` wants for this normal: -> [B, 2] rad."""
-        x, y, z = self.normal.unbind(-1)
+        x, y, z = self.normal.double().unbind(-1)  # atan2 of float32 rounds differently in another batch
         sine = torch.hypot(x, y)
         angle = torch.atan2(sine, -z)
         ratio = torch.where(sine < 1e-9, 1.0, angle / torch.where(sine < 1e-9, 1.0, sine))
-        return torch.stack([ratio * y, -ratio * x], -1)
+        return torch.stack([ratio * y, -ratio * x], -1).to(self.normal)
 
     def seen_from(self, pose: Pose) -> Plane:
         """The same plane in the camera's frame: n_c = R_cw n_w, d_c = d_w + t_wc . n_w, before eq. (2.10)."""

@@ -57,6 +57,10 @@ class Trajectory:
     time: Tensor
     pose: Pose
 
+    def __post_init__(self) -> None:
+        if len(self.time) < 2:
+            raise ValueError(f"a trajectory wants at least two poses, got {len(self.time)}")
+
     def __len__(self) -> int:
         return len(self.time)
 
@@ -80,5 +84,5 @@ class Trajectory:
         """Mean velocity over windows, in the camera frame at their start: start [B] µs | duration [B] s -> Motion [B], units of t."""
         end = start + (duration * 1e6).round().long()
         step = self.at(start).inverse() @ self.at(end)
-        seconds = (end - start).double()[:, None] * 1e-6
+        seconds = (end - start).clamp_min(1).double()[:, None] * 1e-6  # a window without duration has no motion, and no nan
         return Motion(so3.log(step.R) / seconds, step.t / seconds)

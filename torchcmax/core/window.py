@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Window:
-    """B windows of N events each; shorter ones are padded with polarity 0.
+    """B windows of N events each; shorter ones are padded at their end with polarity 0.
 
     ray [B, N, 3] (x, y, 1), undistorted | dt [B, N] s since the window's first event | polarity [B, N] in -1, 0, +1
     start [B] int64 µs | duration [B] s, from the first to the last event

@@ -51,7 +51,7 @@ def _on_sensor(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
             raise DataError(
                 source.path,
                 f"event {seen + i + 1} at pixel ({x}, {y}) is not on the sensor of {width} x {height}",
-                f"give the sensor's true size: --sensor W H, at least {max(x + 1, width)} {max(y + 1, height)}",
+                f"give the sensor's true size, at least --sensor {max(x + 1, width)}x{max(y + 1, height)}, or drop the event",
                 source.place(seen + i),
             )
         seen += len(chunk)

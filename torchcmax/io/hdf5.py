@@ -17,10 +17,11 @@ import torch
 
 from torchcmax.core import so3
 from torchcmax.core.plane import Plane
-from torchcmax.core.pose import Pose, Trajectory
-from torchcmax.io.calibration import Lens
+from torchcmax.core.pose import Trajectory
+from torchcmax.io.calibration import Lens, told_lens
 from torchcmax.io.errors import DataError
-from torchcmax.io.recording import Events, Recording
+from torchcmax.io.recording import LATEST, Events, Recording
+from torchcmax.io.trajectory import checked_plane, checked_trajectory
 
 NAMES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 VERSION = 1
@@ -33,12 +34,12 @@ BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file holds beside the events themselves."""
+    """What a file holds beside the events themselves; the sensor's width and height as they stand there, not checked."""
 
     count: int | None
     name: str = ""
     own: bool = False
-    sensor: tuple[int, int] | None = None
+    sensor: tuple[Any, Any] | None = None
     lens: Lens | None = None
     truth: Trajectory | None = None
     plane: Plane | None = None
@@ -59,13 +60,20 @@ def read_contents(path: Path) -> Contents:
     with _file(path) as file:
         count = _count(path, file)
         own = file.attrs.get("format") == "torchcmax"
-        if own and file.attrs["version"] > VERSION:
-            raise DataError(path, f"is of version {file.attrs['version']}, newer than {VERSION}", "take a newer torchcmax")
+        version = _attribute(file.attrs.get("version"))
+        if own and version != VERSION:
+            raise DataError(path, f"is of version {version}, not {VERSION}", "read it with the torchcmax that wrote it, or a newer one")
         sizes = next((group.attrs for group in (file, file["events"]) if {"width", "height"} <= set(group.attrs)), None)
-        sensor = None if sizes is None else (int(sizes["width"]), int(sizes["height"]))
+        sensor = None if sizes is None else (_attribute(sizes["width"]), _attribute(sizes["height"]))
         lens = _lens(path, file if own else file.get("calib"))
-        truth, plane = (file.get(name) for name in (("truth", "plane") if own else ("groundtruth", "groundtruth/plane")))
-        return Contents(count, str(file.attrs.get("name", "")), own, sensor, lens, _truth(truth), _plane(plane))
+        truth, plane = _truth(path, file, "truth" if own else "groundtruth"), _plane(path, file, "plane" if own else "groundtruth/plane")
+        return Contents(count, str(file.attrs.get("name", "")), own, sensor, lens, truth, plane)
+
+
+def _attribute(value: Any) -> Any:
+    """An attribute as Python has it: numbers that stand alone, lists, text."""
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return value[0] if isinstance(value, list) and len(value) == 1 else value
 
 
 def _count(path: Path, file: Any) -> int:
@@ -75,6 +83,8 @@ def _count(path: Path, file: Any) -> int:
     if len(found) < len(NAMES):
         missing = ", ".join(f"events/{name}" for name in NAMES if name not in found)
         raise DataError(path, f"has no {missing}; it holds {', '.join(file) or 'nothing'}", WANTS)
+    if all(isinstance(data, h5py.Dataset) and not data.size for data in found.values()):
+        raise DataError(path, "holds no events", "record or copy it again")
     if any(not isinstance(data, h5py.Dataset) or data.ndim != 1 or data.dtype.kind not in "iub" for data in found.values()):
         kinds = ", ".join(f"{name}: {getattr(data, 'dtype', 'group')} {getattr(data, 'shape', '')}" for name, data in found.items())
         raise DataError(path, f"has events of another kind: {kinds}", WANTS)
@@ -88,29 +98,34 @@ def _lens(path: Path, group: Any) -> Lens | None:
     """Calibration from the attributes of a group, in our own form or the simulator's."""
     if group is None or "fx" not in group.attrs:
         return None
-    found = group.attrs
-    fx, fy, cx, cy = (float(found[key]) for key in ("fx", "fy", "cx", "cy"))
-    distortion = found["distortion"] if "distortion" in found else [found[key] for key in DISTORTION]
-    model = str(found["model"]).removeprefix("OpenCV ")
-    return Lens(str(path), (fx, fy, cx, cy), tuple(float(number) for number in distortion), model)
+    found = {key: _attribute(value) for key, value in group.attrs.items()}
+    if "k1" in found:
+        found["distortion"] = [found.get(key, 0.0) for key in DISTORTION]
+    found["model"] = str(found.get("model", "plumb_bob")).removeprefix("OpenCV ")
+    return told_lens(str(path), found, f"it wants the attributes fx, fy, cx, cy, model, and distortion or {', '.join(DISTORTION)}")
 
 
-def _truth(group: Any) -> Trajectory | None:
-    """Poses from t, p, q (x, y, z, w); the simulator's t is in seconds, ours in µs."""
-    if group is None:
+def _truth(path: Path, file: Any, name: str) -> Trajectory | None:
+    """Poses from t, p, q (x, y, z, w) of a group; the simulator's t is in seconds, ours in µs."""
+    if name not in file:
         return None
-    t = group["t"][()]
-    time = t if t.dtype.kind == "i" else np.rint(t * 1e6)
-    q, p = (torch.from_numpy(np.asarray(group[name], np.float64)) for name in "qp")
-    return Trajectory(torch.from_numpy(time.astype(np.int64)), Pose(so3.from_quaternion(q), p))
+    t, p, q = (_numbers(path, file, f"{name}/{column}") for column in "tpq")
+    time = t if t.dtype.kind in "iu" else t * 1e6
+    return checked_trajectory(str(path), time, p, q, lambda i: f"{name}, pose {i + 1}")
 
 
-def _plane(data: Any) -> Plane | None:
+def _plane(path: Path, file: Any, name: str) -> Plane | None:
     """The plane from its four numbers."""
-    if data is None:
-        return None
-    numbers = torch.from_numpy(np.asarray(data, np.float64)).reshape(1, 4)
-    return Plane(numbers[:, :3], numbers[:, 3])
+    return checked_plane(str(path), _numbers(path, file, name).reshape(-1), name) if name in file else None
+
+
+def _numbers(path: Path, file: Any, name: str) -> np.ndarray:
+    """All numbers of a dataset."""
+    data = file.get(name)
+    if not isinstance(data, h5py.Dataset) or data.shape is None or data.dtype.kind not in "iuf":
+        raise DataError(path, f"{name} is missing or holds no numbers", "write the ground truth again, or take it out of the file")
+    numbers: np.ndarray = data[()]
+    return numbers
 
 
 def read_events(path: Path, chunk: int) -> Iterator[Events]:
@@ -128,7 +143,7 @@ def read_events(path: Path, chunk: int) -> Iterator[Events]:
 
 def _converted(path: Path, columns: dict[str, np.ndarray], start: int) -> Events:
     """Columns of any integers as Events; polarity -1 is darker, as 0."""
-    for name, least, most in (("t", -(2**63), 2**63 - 1), ("x", 0, 65535), ("y", 0, 65535), ("p", -1, 1)):
+    for name, least, most in (("t", 1 - LATEST, LATEST - 1), ("x", 0, 65535), ("y", 0, 65535), ("p", -1, 1)):
         column = columns[name]
         if column.dtype.kind != "b" and (int(column.min()) < least or int(column.max()) > most):
             i = int(((column < least) | (column > most)).argmax())

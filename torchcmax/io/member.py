@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import lzma
+import os
+import shlex
 import struct
 import zipfile
 import zlib
@@ -14,6 +17,8 @@ from torchcmax.io.errors import DataError
 
 Member = Path | zipfile.Path  # both know `/`, open, iterdir, is_file
 PNG = b"\x89PNG\r\n\x1a\n"
+GZIP, UTF16 = b"\x1f\x8b", (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+SMALL, LARGE = 1 << 20, 100 << 20  # bytes: no calibration or plane has more than the first, no trajectory more than the second
 
 
 def open_zip(path: Path) -> zipfile.Path:
@@ -46,10 +51,33 @@ def size_in_bytes(file: Member) -> int:
     return file.root.getinfo(file.at).file_size if isinstance(file, zipfile.Path) else file.stat().st_size
 
 
-def text_lines(file: Member) -> list[tuple[int, str]]:
-    """Lines of a small text file with their numbers, from 1; empty ones and comments (#) are left out."""
+def not_a_file(path: Path, what: str) -> str:
+    """Why a path cannot be opened as a file: it is something else, or nothing."""
+    return "is no regular file, but a device, a folder or a broken link" if os.path.lexists(path) else f"there is no such {what}"
+
+
+def refuse_foreign(file: Member, head: bytes) -> None:
+    """DataError where a file that should be text begins as plain text never does."""
+    name = shlex.quote(file.name)
+    if head.startswith(GZIP):
+        raise DataError(str(file), "is compressed with gzip", f"unpack it first: gunzip < {name} > unpacked.txt")
+    if head.startswith(UTF16) or b"\0" in head:
+        remedy = f"write it as plain text; if it is UTF-16: iconv -f UTF-16 -t UTF-8 {name} > plain.txt"
+        raise DataError(str(file), f"is not plain text: it begins with {head[:16]!r}", remedy)
+
+
+def text_of(file: Member, most: int = SMALL) -> str:
+    """A text file of at most so many bytes, without a byte order mark; DataError where it has more."""
     with reading(file), file.open("rb") as stream:
-        text = stream.read().decode("utf-8", "backslashreplace")
+        text = stream.read(most + 1)
+    if len(text) > most:
+        raise DataError(str(file), f"has more than {most >> 20} MiB, too much for what it should hold", "put the right file there")
+    refuse_foreign(file, text)
+    return text.decode("utf-8-sig", "backslashreplace")
+
+
+def text_lines(text: str) -> list[tuple[int, str]]:
+    """Lines of a text with their numbers, from 1; empty ones and comments (#) are left out."""
     lines = [(number, line.strip()) for number, line in enumerate(text.split("\n"), 1)]
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 

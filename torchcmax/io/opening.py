@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,13 +15,13 @@ import h5py
 from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
-from torchcmax.io.calibration import ECD_FORM, Lens, guess_sensor, pinhole, read_lens
+from torchcmax.io.calibration import ECD_FORM, Lens, checked_size, guess_sensor, read_lens
 from torchcmax.io.checked import Source, checked
-from torchcmax.io.errors import DataError
+from torchcmax.io.errors import DataError, DataWarning
 from torchcmax.io.hdf5 import Contents, read_contents, read_events
-from torchcmax.io.member import Member, image_size, open_zip, reading
+from torchcmax.io.member import GZIP, UTF16, Member, image_size, not_a_file, open_zip, reading
 from torchcmax.io.recording import Events, Recording
-from torchcmax.io.text import check_end, line_of, read_text
+from torchcmax.io.text import NUMBER, check_text, line_of, read_text
 from torchcmax.io.trajectory import read_plane, read_trajectory
 
 WANTED = "give a folder with events.txt (lines t x y p) or events.h5, and calib.txt; the same as a .zip; or an HDF5 file"
@@ -52,7 +54,7 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
         if path.is_dir():
             return _folder(path, options)
         if not path.is_file():
-            raise DataError(path, "there is no such file or folder", "check the name; " + WANTED)
+            raise DataError(path, not_a_file(path, "file or folder"), "check the name; " + WANTED)
         with path.open("rb") as stream:
             head = stream.read(4096)
     if not head:
@@ -61,7 +63,7 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
         return _hdf5(path, options)
     if head.startswith(b"PK") or zipfile.is_zipfile(path):
         return _text(open_zip(path), path, path.stem, options)
-    if path.suffix == ".txt" or _like_events(head):
+    if path.suffix == ".txt" or _like_events(head) or head.startswith((GZIP, *UTF16)):
         return _text(path.parent, path, path.parent.resolve().name, options, path.name)
     kind = "should be an HDF5 file and is none" if path.suffix in (".h5", ".hdf5") else "is not a recording"
     raise DataError(path, f"{kind}: it begins with {head[:16]!r}", WANTED)
@@ -69,12 +71,15 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
 
 def _like_events(head: bytes) -> bool:
     """Whether the first line that is no comment has four columns, the first a number."""
-    lines = [line.split() for line in head.split(b"\n") if line.strip() and not line.startswith(b"#")]
-    return bool(lines) and len(lines[0]) == 4 and lines[0][0].replace(b".", b"").isdigit()
+    lines = [line.split() for line in head.removeprefix(codecs.BOM_UTF8).split(b"\n") if line.strip() and not line.startswith(b"#")]
+    return bool(lines) and len(lines[0]) == 4 and NUMBER.fullmatch(lines[0][0].decode("ascii", "replace")) is not None
 
 
 def _folder(folder: Path, options: OpenOptions) -> Recording:
     if (folder / "events.h5").is_file():
+        if (folder / "events.txt").is_file():
+            text = f"{folder}: holds events.h5 and events.txt; events.txt is ignored, to read it give its own path"
+            warnings.warn(DataWarning(text), stacklevel=3)
         return _hdf5(folder / "events.h5", options)
     if (folder / "events.txt").is_file():
         return _text(folder, folder / "events.txt", folder.resolve().name, options)
@@ -86,11 +91,11 @@ def _folder(folder: Path, options: OpenOptions) -> Recording:
 def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: str = "events.txt") -> Recording:
     """A recording as text, in a folder or a .zip."""
     file = folder / events
-    check_end(file)
+    check_text(file)
     raw = partial(read_text, file, options.chunk)
-    camera = _camera(folder, Contents(None, sensor=image_size(folder)), str(file), options, raw)
+    camera, guessed = _camera(folder, Contents(None, sensor=image_size(folder)), str(file), options, raw)
     source = Source(str(file), camera.size[::-1], partial(line_of, file), options.strict)
-    return Recording(path, name, camera, lambda: checked(raw(), source), None, *_truth(folder))
+    return Recording(path, name, camera, lambda: checked(raw(), source), None, *_truth(folder), guessed)
 
 
 def _hdf5(path: Path, options: OpenOptions) -> Recording:
@@ -98,15 +103,21 @@ def _hdf5(path: Path, options: OpenOptions) -> Recording:
     contents = read_contents(path)
     raw = partial(read_events, path, options.chunk)
     folder = None if contents.own else path.parent
-    camera = _camera(folder, contents, str(path), options, raw)
-    truth, plane = (None, None) if folder is None else _truth(folder)
+    camera, guessed = _camera(folder, contents, str(path), options, raw)
+    beside = (None, None) if folder is None else _truth(folder)
+    truth, plane = beside[0] or contents.truth, beside[1] or contents.plane
     name = contents.name or (path.parent.resolve().name if path.stem == "events" else path.stem)
     source = Source(str(path), camera.size[::-1], lambda event: f"event {event + 1}", options.strict)
-    return Recording(path, name, camera, lambda: checked(raw(), source), contents.count, truth or contents.truth, plane or contents.plane)
+    return Recording(path, name, camera, lambda: checked(raw(), source), contents.count, truth, plane, guessed)
 
 
-def _camera(folder: Member | None, contents: Contents, file: str, options: OpenOptions, raw: Callable[[], Iterator[Events]]) -> Camera:
-    """The camera: its lens from the options, calib.txt or the file; its size from the options, the lens's file, the file, or the events."""
+def _camera(
+    folder: Member | None, contents: Contents, file: str, options: OpenOptions, raw: Callable[[], Iterator[Events]]
+) -> tuple[Camera, bool]:
+    """The camera, and whether its size is guessed.
+
+    Its lens is from the options, calib.txt or the file; its size from the options, the lens's file, the file, or the events.
+    """
     lens: Lens | None = None
     if options.camera and options.camera != "pinhole":
         lens = read_lens(Path(options.camera))
@@ -115,11 +126,11 @@ def _camera(folder: Member | None, contents: Contents, file: str, options: OpenO
     elif not options.camera:
         lens = contents.lens
         if lens is None:
-            remedy = f"put {ECD_FORM} into a file calib.txt beside the events, give --camera FILE, or --camera pinhole [--sensor W H]"
+            remedy = f"put {ECD_FORM} into a file calib.txt beside the events, give --camera FILE, or --camera pinhole [--sensor 240x180]"
             raise DataError(file, "there is no calibration for it", remedy)
     known = options.sensor or (lens and lens.sensor) or contents.sensor
-    sensor = known or guess_sensor(file, lens, raw)
-    return pinhole(file, sensor) if lens is None else lens.camera(sensor)
+    sensor = checked_size(file, *known) if known else guess_sensor(file, lens, raw)
+    return (Camera.pinhole(sensor[::-1]) if lens is None else lens.camera(sensor)), not known
 
 
 def _truth(folder: Member) -> tuple[Trajectory | None, Plane | None]:

@@ -22,9 +22,39 @@ HOT_RATIO, HOT_COUNT = 50, 1000  # a hot pixel has more than both: times the med
 
 
 @dataclass(frozen=True)
-class Summary:
-    """Times in µs, rates in events per second; gaps are (start, length), hot pixels (x, y, events)."""
+class Calibration:
+    """fx, fy, cx, cy in px; distortion as the model wants it."""
 
+    model: str
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The time that the ground truth spans."""
+
+    first_us: int
+    last_us: int
+    poses: int
+
+
+@dataclass(frozen=True)
+class Summary:
+    """sensor is (width, height) px, plane (nx, ny, nz, d) as in plane.txt.
+
+    Times in µs, rates in events per second; gaps are (start, length), hot pixels (x, y, events).
+    """
+
+    recording: str
+    sensor: tuple[int, int]
+    sensor_guessed: bool
+    calibration: Calibration
+    truth: Truth | None
+    plane: tuple[float, ...] | None
     count: int
     first: int
     last: int
@@ -46,9 +76,16 @@ class Summary:
     def __str__(self) -> str:
         """A page to read: one line per number, and the rate over time as bars."""
         top = max(self.rates)
+        lens, truth = self.calibration, self.truth
+        distortion = ", ".join(f"{k:.6g}" for k in lens.distortion)
         lines = [
+            f"recording     {self.recording}",
+            f"sensor        {self.sensor[0]} x {self.sensor[1]}{', guessed from the events' if self.sensor_guessed else ''}",
+            f"calibration   fx {lens.fx:g} fy {lens.fy:g} cx {lens.cx:g} cy {lens.cy:g} px, {lens.model} {distortion}",
+            f"truth         {'none' if truth is None else f'{truth.poses} poses, {_span(truth.first_us, truth.last_us)}'}",
+            f"plane         {'none' if self.plane is None else 'normal {:.4f} {:.4f} {:.4f}, distance {:.4f} m'.format(*self.plane)}",
             f"events        {self.count}, {self.on_share:.1%} ON",
-            f"time          {self.first * 1e-6:.6f} s to {self.last * 1e-6:.6f} s, {self.duration * 1e-6:.6f} s long",
+            f"time          {_span(self.first, self.last)}, {self.duration * 1e-6:.6f} s long",
             f"rate          {self.mean_rate * 1e-6:.3f} Mev/s, at most {self.peak_rate * 1e-6:.3f} Mev/s over {PEAK // 1000} ms",
             f"equal times   {self.equal_times}",
             f"out of order  {self.out_of_order}",
@@ -61,6 +98,10 @@ class Summary:
             *(f"problem: {problem}" for problem in self.problems),
         ]
         return "\n".join(lines)
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first * 1e-6:.6f} s to {last * 1e-6:.6f} s"
 
 
 @dataclass
@@ -127,9 +168,20 @@ def summary(recording: Recording) -> Summary:
     hot = _hot(pixels)
     listed = [(int(i % width), int(i // width), int(pixels[i])) for i in hot[:LISTED_PIXELS]]
     time = count, rate.first, last, duration
-    found = Summary(*time, on / count, mean, peak, *rate.shown(), gaps, gap_count, gap_total, equal, late, listed, len(hot), [])
+    found = Summary(
+        *_known(recording), *time, on / count, mean, peak, *rate.shown(), gaps, gap_count, gap_total, equal, late, listed, len(hot), []
+    )
     found.problems.extend([*map(str, told), *_problems(found)])
     return found
+
+
+def _known(recording: Recording) -> tuple[str, tuple[int, int], bool, Calibration, Truth | None, tuple[float, ...] | None]:
+    """What a summary begins with, known before the events are read."""
+    camera, truth, plane = recording.camera, recording.truth, recording.plane
+    calibration = Calibration(camera.model, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
+    span = None if truth is None else Truth(int(truth.time[0]), int(truth.time[-1]), len(truth))
+    numbers = None if plane is None else (*plane.normal[0].tolist(), plane.distance[0].item())
+    return recording.name, (camera.size[1], camera.size[0]), recording.guessed, calibration, span, numbers
 
 
 @contextmanager
@@ -156,6 +208,12 @@ def _hot(pixels: np.ndarray) -> np.ndarray:
 def _problems(found: Summary) -> list[str]:
     """What a user should know before trusting results, in plain words."""
     problems = []
+    if found.sensor_guessed:
+        width, height = found.sensor
+        problems.append(f"the sensor's size, {width} x {height}, is guessed from the events: if it is another, give --sensor WIDTHxHEIGHT")
+    if found.truth is not None and not found.truth.first_us <= found.first <= found.last <= found.truth.last_us:
+        spans = _span(found.truth.first_us, found.truth.last_us), _span(found.first, found.last)
+        problems.append(f"the truth does not cover the events: the truth spans {spans[0]}, the events {spans[1]}")
     if not found.duration:
         problems.append("all events have the same time: time stamps are missing")
     elif found.duration > 1e11 and found.mean_rate < 10:

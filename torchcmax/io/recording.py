@@ -15,10 +15,12 @@ from torchcmax.core.pose import Trajectory
 from torchcmax.core.window import Window
 from torchcmax.io.errors import DataError
 
+LATEST = 1 << 61  # µs before or after zero: the difference of two times fits into int64
+
 
 @dataclass(frozen=True)
 class Events:
-    """t [M] int64 µs | x, y [M] uint16 px (column, row) | p [M] uint8, 1 = brighter (ON), 0 = darker (OFF)."""
+    """t [M] int64 µs, within LATEST | x, y [M] uint16 px (column, row) | p [M] uint8, 1 = brighter (ON), 0 = darker (OFF)."""
 
     t: np.ndarray
     x: np.ndarray
@@ -43,6 +45,7 @@ class Recording:
 
     truth is T_wc in metres, plane (normal [1, 3], distance [1] m) in the same world; either may be missing.
     count is the number of events, None where only reading the whole file would tell.
+    guessed: the sensor's size comes from the events alone, as nothing else told it.
     """
 
     path: Path
@@ -52,6 +55,7 @@ class Recording:
     count: int | None = None
     truth: Trajectory | None = None
     plane: Plane | None = None
+    guessed: bool = False
 
     def windows(self, events: int, stride: int | None = None, batch: int = 1) -> Iterator[Window]:
         """Windows of `events` events, each `stride` events after the last (default: end to end), `batch` at a time.

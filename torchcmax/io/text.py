@@ -2,38 +2,68 @@
 
 from __future__ import annotations
 
+import codecs
 import re
+import shlex
+import zipfile
 from collections.abc import Iterator
+from itertools import islice
 from typing import IO
 
 import numpy as np
 
 from torchcmax.io.errors import DataError
-from torchcmax.io.member import Member, reading, size_in_bytes
-from torchcmax.io.recording import Events
+from torchcmax.io.member import Member, reading, refuse_foreign, size_in_bytes
+from torchcmax.io.recording import LATEST, Events
 
 BLOCK = 1 << 20  # bytes taken apart at a time: fits the processor's cache
 LONGEST = 1 << 16  # bytes of a line; more is no text of events
+FORM = "t x y p, separated by blanks: seconds, column, row, 0 or 1, like 0.003811 96 133 0"
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 BETWEEN = np.frombuffer(b".   \n", np.uint8)  # what stands between the digits of a line: 1.234567 12 34 1
 MOST = (12, 5, 5, 1)  # digits of whole seconds, column, row, polarity
 SPELLINGS = ((b"\r\n", b"\n"), (b"\t", b" "), (b" -1\n", b" 0\n"))
 
 
-def check_end(file: Member) -> None:
-    """Finds a last line that is cut off, before anything is computed.  A member of a .zip is unpacked once for that."""
+def check_text(file: Member) -> None:
+    """Finds a file of another form and a last line that is cut off, before anything is computed.  A .zip is unpacked once for that."""
     size = size_in_bytes(file)
     if not size:
         raise DataError(str(file), "is empty", "record or copy it again")
     with reading(file), file.open("rb") as stream:
+        refuse_foreign(file, stream.read(LONGEST))
+    _check_first(file)
+    _check_last(file, size)
+
+
+def _check_first(file: Member) -> None:
+    """A first line that is no event: the whole file is of another form, so dropping the line would not help."""
+    for number, first in islice(_data_lines(file), 1):
+        row = first.decode("ascii", "backslashreplace").strip()
+        try:
+            _row(row)
+        except ValueError as error:
+            problem = f"its first line is no event, {error}: {_quoted(row)}"
+            raise DataError(str(file), problem, f"events want lines of {FORM}; put a # before a header", f"line {number}") from error
+
+
+def _check_last(file: Member, size: int) -> None:
+    with reading(file), file.open("rb") as stream:
         stream.seek(max(size - LONGEST, 0))
-        last = stream.read().rsplit(b"\n", 1)[-1]
+        last = stream.read().rsplit(b"\n", 1)[-1].removeprefix(codecs.BOM_UTF8)
     if last.strip() and not last.lstrip().startswith(b"#") and len(last.split()) < 4:
         with reading(file), file.open("rb") as stream:
             number = sum(block.count(b"\n") for block in _blocks(stream, BLOCK, file))
         cut = _quoted(last.decode("ascii", "backslashreplace"))
-        remedy = f"the file was not copied or written to its end; copy it again, or drop the line: sed -i '$d' {file}"
+        remedy = f"the file was not copied or written to its end; copy it again, or drop the line: {_dropping(file, '$')}"
         raise DataError(str(file), f"the last line is cut off: {cut}", remedy, f"line {number}")
+
+
+def _dropping(file: Member, line: str) -> str:
+    """How to drop a line of a file: its number, or $ for the last."""
+    if isinstance(file, zipfile.Path):
+        return f"unpack {file.root.filename}, drop the line there, and open the folder"
+    return f"sed -i '{line}d' {shlex.quote(str(file))}"
 
 
 def read_text(file: Member, chunk: int, block: int = BLOCK) -> Iterator[Events]:
@@ -56,23 +86,27 @@ def read_text(file: Member, chunk: int, block: int = BLOCK) -> Iterator[Events]:
 
 def line_of(file: Member, event: int) -> str:
     """Where an event, counted from 0, stands in the file; reads it again up to there."""
+    return next((f"line {number}" for number, _ in islice(_data_lines(file), event, None)), "at its end")
+
+
+def _data_lines(file: Member) -> Iterator[tuple[int, bytes]]:
+    """Lines that are neither empty nor comments, with their numbers, from 1."""
     with reading(file), file.open("rb") as stream:
         rows = (row for text in _blocks(stream, BLOCK, file) for row in text.split(b"\n")[:-1])
         for number, row in enumerate(rows, 1):
             if row.strip() and not row.lstrip().startswith(b"#"):
-                event -= 1
-            if event < 0:
-                return f"line {number}"
-    return "at its end"
+                yield number, row
 
 
 def _blocks(stream: IO[bytes], size: int, file: Member) -> Iterator[bytes]:
-    """Whole lines, about `size` bytes of them."""
+    """Whole lines, about `size` bytes of them, without a byte order mark before the first."""
+    if stream.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
+        stream.seek(0)
     passed, rest = 0, b""
     while piece := stream.read(size):
         cut = piece.rfind(b"\n") + 1
         if len(rest) + (piece.find(b"\n") if cut else len(piece)) > LONGEST:
-            raise DataError(str(file), f"a line of more than {LONGEST} bytes: no text of events", "lines are t x y p", f"byte {passed + 1}")
+            raise DataError(str(file), f"a line of more than {LONGEST} bytes: no text of events", f"lines are {FORM}", f"byte {passed + 1}")
         if cut:
             yield rest + piece[:cut]
             passed, rest = passed + len(rest) + cut, piece[cut:]
@@ -143,7 +177,7 @@ def _by_line(text: bytes, line: int, file: Member) -> Events:
             try:
                 rows.append(_row(row))
             except ValueError as error:
-                remedy = f"a line is t x y p: seconds, column, row, 0 or 1; to drop this one: sed -i '{number}d' {file}"
+                remedy = f"a line is {FORM}; to drop this one: {_dropping(file, str(number))}"
                 raise DataError(str(file), f"{error}: {_quoted(row)}", remedy, f"line {number}") from error
     t, x, y, p = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Events(np.array(t, np.int64), np.array(x, np.uint16), np.array(y, np.uint16), np.array(p, np.uint8))
@@ -160,7 +194,7 @@ def _row(row: str) -> tuple[int, int, int, int]:
         if not NUMBER.fullmatch(column):
             raise ValueError(f"{_quoted(column)} is not a number")
     t, x, y, p = map(float, columns)
-    if not abs(t) < 9e12:
+    if not abs(t * 1e6) < LATEST:
         raise ValueError(f"{columns[0]} is no time in seconds")
     if not (x.is_integer() and y.is_integer() and 0 <= x <= 65535 and 0 <= y <= 65535):
         raise ValueError(f"({columns[1]}, {columns[2]}) is no pixel")

@@ -13,7 +13,8 @@ from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose, Trajectory
 from torchcmax.io.errors import DataError
-from torchcmax.io.member import Member, text_lines
+from torchcmax.io.member import LARGE, SMALL, Member, text_lines, text_of
+from torchcmax.io.recording import LATEST
 
 TUM = "t tx ty tz qx qy qz qw"
 VELOCITY = "t[s]  v_x v_y v_z [m/s]  w_x w_y w_z [rad/s]   (body frame = camera frame)"
@@ -22,30 +23,37 @@ PLANE = "nx ny nz d   with n.X + d = 0 in the world frame, n unit and towards th
 
 def read_trajectory(file: Member) -> Trajectory:
     """T_wc from lines `t tx ty tz qx qy qz qw`, t in seconds -> Trajectory in int64 µs and float64, at least two poses."""
-    rows = _rows(file, 8, f"a line is {TUM}")
-    if len(rows) < 2:
-        raise DataError(str(file), f"holds {len(rows)} poses", f"a trajectory wants at least 2 lines of {TUM}")
-    table = np.array([values for _, values in rows])
-    time = np.rint(table[:, 0] * 1e6).astype(np.int64)
-    length = np.linalg.norm(table[:, 4:], axis=1)
-    lines = [number for number, _ in rows]
-    _refuse(file, lines, abs(length - 1) > 0.01, "qx qy qz qw is no unit quaternion", f"a line is {TUM}, the quaternion with qw last")
-    backward = np.concatenate([[False], time[1:] <= time[:-1]])
-    _refuse(file, lines, backward, "time does not increase", "sort the lines by time and keep one per time: sort -n -u -k1,1")
-    pose = Pose(so3.from_quaternion(torch.from_numpy(table[:, 4:])), torch.from_numpy(table[:, 1:4].copy()))
-    return Trajectory(torch.from_numpy(time), pose)
+    rows = _rows(file, 8, f"a line is {TUM}", LARGE)
+    table = np.array([values for _, values in rows]).reshape(-1, 8)
+    return checked_trajectory(str(file), table[:, 0] * 1e6, table[:, 1:4], table[:, 4:], lambda i: f"line {rows[i][0]}")
 
 
-def _refuse(file: Member, lines: list[int], wrong: np.ndarray, problem: str, remedy: str) -> None:
-    """DataError at the first line that is wrong, if one is."""
-    if wrong.any():
-        raise DataError(str(file), problem, remedy, f"line {lines[int(wrong.argmax())]}")
+def checked_trajectory(file: str, time: np.ndarray, p: np.ndarray, q: np.ndarray, place: Callable[[int], str]) -> Trajectory:
+    """Poses from any file: time [M] µs | p [M, 3] m | q [M, 4], x y z w -> Trajectory; place: pose, from 0 -> where it stands."""
+    wants = f"a pose is {TUM}, the quaternion of length 1 with qw last"
+
+    def refuse(wrong: np.ndarray, problem: str, remedy: str) -> None:
+        if wrong.any():
+            raise DataError(file, problem, remedy, place(int(wrong.argmax())))
+
+    if time.ndim != 1 or p.shape != (len(time), 3) or q.shape != (len(time), 4):
+        raise DataError(file, f"has poses of shapes t {time.shape}, p {p.shape}, q {q.shape}", f"{wants}: shapes (M,), (M, 3), (M, 4)")
+    if len(time) < 2:
+        raise DataError(file, f"holds {len(time)} poses", f"a trajectory wants at least 2; {wants}")
+    known = (time > -LATEST) & (time < LATEST) & np.isfinite(p).all(1) & np.isfinite(q).all(1)
+    refuse(~known, "a number out of all range", wants)
+    refuse(abs(np.linalg.norm(q, axis=1) - 1) > 0.01, "qx qy qz qw is no unit quaternion", wants)
+    micro = (time if time.dtype.kind in "iu" else np.rint(time)).astype(np.int64)
+    backward = np.concatenate([[False], micro[1:] <= micro[:-1]])
+    refuse(backward, "time does not increase", "sort the poses by time and keep one per time; lines of text: sort -n -u -k1,1")
+    position, quaternion = (torch.from_numpy(numbers.astype(np.float64)) for numbers in (p, q))
+    return Trajectory(torch.from_numpy(micro), Pose(so3.from_quaternion(quaternion), position))
 
 
-def _rows(file: Member, columns: int, remedy: str) -> list[tuple[int, list[float]]]:
-    """Lines of numbers with their line numbers."""
+def _rows(file: Member, columns: int, remedy: str, most: int) -> list[tuple[int, list[float]]]:
+    """Lines of numbers with their line numbers, from a file of at most so many bytes."""
     rows = []
-    for number, line in text_lines(file):
+    for number, line in text_lines(text_of(file, most)):
         words = line.split()
         try:
             values = [float(word) for word in words]
@@ -53,8 +61,6 @@ def _rows(file: Member, columns: int, remedy: str) -> list[tuple[int, list[float
             raise DataError(str(file), f"not all are numbers: {line[:80]!r}", remedy, f"line {number}") from error
         if len(values) != columns:
             raise DataError(str(file), f"{len(values)} columns instead of {columns}: {line[:80]!r}", remedy, f"line {number}")
-        if not np.isfinite(values).all() or abs(values[0]) > 9e12:
-            raise DataError(str(file), f"a number out of all range: {line[:80]!r}", remedy, f"line {number}")
         rows.append((number, values))
     return rows
 
@@ -88,13 +94,19 @@ def _write_text(path: Path, text: str) -> None:
 
 def read_plane(file: Member) -> Plane:
     """The plane n . x + d = 0 of the world from a line `nx ny nz d` -> Plane [1], float64, metres."""
-    rows = _rows(file, 4, f"it wants one line: {PLANE}")
+    rows = _rows(file, 4, f"it wants one line: {PLANE}", SMALL)
     if len(rows) != 1:
         raise DataError(str(file), f"holds {len(rows)} lines of numbers", f"it wants one line: {PLANE}")
     number, values = rows[0]
-    if abs(np.linalg.norm(values[:3]) - 1) > 1e-3 or values[3] <= 0:
-        raise DataError(str(file), f"{values} is no unit normal with a positive distance", f"it wants {PLANE}", f"line {number}")
-    table = torch.tensor([values], dtype=torch.float64)
+    return checked_plane(str(file), np.array(values), f"line {number}")
+
+
+def checked_plane(file: str, numbers: np.ndarray, place: str) -> Plane:
+    """The plane from any file: numbers [4], nx ny nz d -> Plane [1], float64, metres."""
+    known = numbers.shape == (4,) and np.isfinite(numbers).all()
+    if not known or abs(np.linalg.norm(numbers[:3]) - 1) > 1e-3 or numbers[3] <= 0:
+        raise DataError(file, f"{numbers.tolist()} is no unit normal with a positive distance", f"it wants {PLANE}", place)
+    table = torch.from_numpy(numbers.astype(np.float64))[None]
     return Plane(table[:, :3], table[:, 3])
 
 
