@@ -97,8 +97,9 @@ def main() -> int:
         for kind, model in (("known", PlanarKnown(recording.camera.fx, plane.normal)), ("free", MODELS["planar"](recording.camera.fx))):
             found = estimate(window, recording.camera, model)
             error = end_point_error(window, found, truth, plane, recording.camera.fx)
-            middle, most = error.median().item(), error.quantile(0.9).item()
-            text = f"| {name}, plane {kind} | median end-point error {middle:.3f} px, 90 % of the windows below {most:.2f} px"
+            middle, most, above = error.median().item(), error.quantile(0.9).item(), int((error > 0.5).sum())
+            text = f"| {name}, plane {kind} | median end-point error {middle:.3f} px, 90 % below {most:.2f} px"
+            text += f", {above} of {len(error)} above 0.5 px"
             if kind == "free" and found.normal is not None:
                 angle = (found.normal.double() * plane.normal).sum(-1).clamp(-1, 1).arccos().rad2deg()
                 text += f", normal off by {angle.median().item():.1f} deg"

@@ -44,6 +44,15 @@ def test_every_command_and_snippet_runs(place):
     assert (place / "logs" / "thesis" / "figure_2_3.png").is_file()
 
 
+def test_every_link_leads_somewhere_and_nothing_waits_to_be_filled_in():
+    text = (ROOT / "README.md").read_text()
+    links = re.findall(r"\]\(([^)#]+)\)", text)
+    assert len(links) >= 2
+    for link in links:
+        assert (ROOT / link).exists(), link
+    assert not re.findall(r"\b[A-Z]+_[A-Z]+\b|\bTODO\b", text.replace("OMP_WAIT_POLICY", ""))
+
+
 def test_the_readme_begins_with_the_two_commands():
     assert COMMANDS[:2] == ["scripts/run", "scripts/run pytest"]
 
