@@ -64,6 +64,7 @@ def test_a_wrong_line_in_a_zip_is_to_be_dropped_outside_of_it(tmp_path):
         (GOOD.encode("utf-16-be"), "is not plain text"),
         (b"\x7fELF\0\0", "is not plain text"),
     ],
+    ids=["gzip", "utf-16", "utf-16-be", "a program"],
 )
 def test_files_that_are_no_plain_text(folder, tmp_path, data, words):
     refused(folder(data), words, "events.txt")
