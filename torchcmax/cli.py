@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import re
 import sys
@@ -156,7 +157,7 @@ def run_compensate(config: Namespace) -> int:
             bar.update(len(window))
     found = report.summary()
     print(
-        f"{found['windows']} windows, median gain {found['gain_median']:.4f}, {found['mega_events_per_second']:.2f} Mev/s\n"
+        f"{found['windows']} windows, median gain {found['gain_median'] or math.nan:.4f}, {found['mega_events_per_second']:.2f} Mev/s\n"
         f"motions: {report.folder / 'windows.csv'}\npictures: {report.folder / 'images'} ({found['pictures']})\n"
         f"curves: tensorboard --logdir {report.folder}"
     )

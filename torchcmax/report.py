@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import platform
 import tempfile
 import time
@@ -196,7 +197,8 @@ class Report:
         events = sum(line["events"] for line in self.table)
 
         def median(name: str) -> float | None:
-            return float(np.median([line[name] for line in self.table])) if self.table else None
+            numbers = [line[name] for line in self.table if math.isfinite(line[name])]  # JSON has no nan
+            return float(np.median(numbers)) if numbers else None
 
         return {
             "complete": stopped is None,

@@ -93,7 +93,8 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
         traces.append((-found.trace).exp())
         x = found.x
     found = replace(found, iterations=iterations, evaluations=evaluations)
-    return _report(window, model, look, look.at(window, canvas, search.blur[-1]), found, tuple(traces))
+    result = _report(window, model, look, look.at(window, canvas, search.blur[-1]), found)
+    return replace(result, traces=tuple(traces))
 
 
 def starts(window: Window, model: Model, far: float) -> Tensor:
@@ -139,7 +140,7 @@ def rates(displacement: Displacement, window: Window) -> Motion:
     return Motion(displacement.turn * per_second, displacement.shift * per_second)
 
 
-def _report(window: Window, model: Model, look: Look, view: View, found: Minimum, traces: tuple[Tensor, ...]) -> Estimate:
+def _report(window: Window, model: Model, look: Look, view: View, found: Minimum) -> Estimate:
     """The last minimum of every window, in units that people read, with the contrast that all its events have."""
     owner = torch.arange(len(window), device=found.x.device)
     x = torch.where((window.duration > 0)[:, None], found.x, 0.0)  # events that come all at once show no motion
@@ -156,5 +157,5 @@ def _report(window: Window, model: Model, look: Look, view: View, found: Minimum
         iterations=found.iterations,
         evaluations=found.evaluations,
         converged=found.converged & (window.duration > 0),
-        traces=traces,
+        traces=(),
     )
