@@ -20,7 +20,7 @@ from tqdm import tqdm
 from torchcmax import __version__
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.config import USAGE_ERROR, Parser, UsageError, command, parser, usage
-from torchcmax.io import DataError, DataWarning, OpenOptions, Recording, open, summary
+from torchcmax.io import DataError, DataNote, DataWarning, OpenOptions, Recording, open, summary
 from torchcmax.report import Report
 from torchcmax.simulator import Simulation, write
 
@@ -91,8 +91,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _say(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: Any = None, line: str | None = None) -> None:
-    if issubclass(category, DataWarning):  # others are for developers
-        print(f"warning: {message}", file=sys.stderr)
+    if issubclass(category, (DataWarning, DataNote)):  # others are for developers
+        print(f"{'note' if issubclass(category, DataNote) else 'warning'}: {message}", file=sys.stderr)
 
 
 def _dataclass(kind: type[T], config: Namespace) -> T:

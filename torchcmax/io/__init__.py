@@ -1,9 +1,9 @@
 """Recordings in and out of files: `open` reads every form we know, `save` writes our own."""
 
-from torchcmax.io.errors import DataError, DataWarning
+from torchcmax.io.errors import DataError, DataNote, DataWarning
 from torchcmax.io.hdf5 import save
 from torchcmax.io.opening import OpenOptions, open
 from torchcmax.io.overview import Summary, summary
 from torchcmax.io.recording import Events, Recording
 
-__all__ = ["DataError", "DataWarning", "Events", "OpenOptions", "Recording", "Summary", "open", "save", "summary"]
+__all__ = ["DataError", "DataNote", "DataWarning", "Events", "OpenOptions", "Recording", "Summary", "open", "save", "summary"]

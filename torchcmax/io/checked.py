@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcmax.io.errors import DataError, DataWarning
+from torchcmax.io.errors import DataError, DataNote, DataWarning
 from torchcmax.io.recording import Events
 
 SORT = "sort -s -n -k1,1 events.txt > sorted.txt"
@@ -35,7 +35,8 @@ class Reordered(DataWarning):
 def checked(raw: Iterator[Events], source: Source) -> Iterator[Events]:
     """Events on the sensor, in order of time; equal times stay in the order of the file.
 
-    An event that is late by less than a chunk is put in its place, and one DataWarning at the end of the pass counts them.
+    An event that is late by less than a chunk is put in its place, and one DataWarning at the end of the pass counts them; a
+    DataNote counts the equal times.
     """
     return _in_order(_on_sensor(raw, source), source)
 
@@ -61,7 +62,7 @@ def _on_sensor(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
 def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
     """Sorts within two chunks: one is held back, so that late events of the next can still go before it."""
     held: Events | None = None
-    handed, seen, late, where = np.iinfo(np.int64).min, 0, 0, ""
+    handed, seen, late, equal, where = np.iinfo(np.int64).min, 0, 0, 0, ""
     try:
         for chunk in chunks:
             if not len(chunk):
@@ -78,6 +79,7 @@ def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
                     raise _too_late(chunk, handed, seen, source)
                 late, where = late + len(behind), where or source.place(seen + int(behind[0]))
                 ready, held = _merged(held, chunk)
+            equal += int((chunk.t == before).sum()) - (seen == 0)  # the first of all has none before it
             seen += len(chunk)
             if ready is not None and len(ready):
                 handed = int(ready.t[-1])
@@ -88,6 +90,9 @@ def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
         if late:
             text = f"{source.path}: {late} of {seen} events were out of order and have been sorted, the first at {where}"
             warnings.warn(Reordered(text, late), stacklevel=2)
+        if equal:
+            text = f"{source.path}: {equal} of {seen} events have the time of the one before; they stay in the order of the file"
+            warnings.warn(DataNote(f"{text} (--strict refuses them)"), stacklevel=2)
 
 
 def _merged(held: Events | None, chunk: Events) -> tuple[Events, Events]:

@@ -16,3 +16,7 @@ class DataError(Exception):
 
 class DataWarning(UserWarning):
     """Something in a file that was mended or left out, and said so."""
+
+
+class DataNote(UserWarning):
+    """Something in a file that is worth knowing and changes nothing."""
