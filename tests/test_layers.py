@@ -40,7 +40,7 @@ def test_imports_point_downwards():
 
 
 def test_core_is_a_chain_and_knows_torch_and_kornia_only():
-    allowed = {"__future__", "torch", "kornia", "torchcmax", "dataclasses", "typing", "collections", "functools", "math"}
+    allowed = {"__future__", "torch", "kornia", "torchcmax", "dataclasses", "typing", "collections", "functools", "math", "abc"}
     for path in (ROOT / "core").glob("*.py"):
         for name in imported(path):
             assert name[0] in allowed, f"core/{path.name} must not import {name[0]}"

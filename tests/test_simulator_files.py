@@ -37,6 +37,13 @@ def test_written_files_are_the_recording(tmp_path):
     assert "* threshold: 0.25" in (folder / "README.md").read_text()
 
 
+def test_a_changed_calibration_counts_in_the_folder_and_not_for_the_file_alone(tmp_path):
+    folder = write(SMALL, tmp_path / "small")
+    (folder / "calib.txt").write_text("60 61 30 25 0 0 0 0 0\n")
+    assert opening.open(folder).camera.fx == 60
+    assert opening.open(folder / "events.h5").camera.fx == SMALL.focal
+
+
 def test_only_our_own_folder_is_replaced(tmp_path):
     folder = write(SMALL, tmp_path / "small")
     write(dataclasses.replace(SMALL, seed=3), folder)

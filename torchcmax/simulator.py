@@ -53,7 +53,7 @@ README = """# {name}
 {mark} {count} events with exact ground truth.
 
 * events.h5: events/t int64 us, sorted; events/x, events/y (column, row) raw distorted pixels; events/p 1 = brighter, 0 = darker;
-  with calibration, ground truth and plane, so that it can stand alone: change calib.txt and it is not looked at
+  with calibration, ground truth and plane, so that it can stand alone; opened as a folder, the text files count
 * calib.txt: fx fy cx cy k1 k2 p1 p2 k3, as OpenCV; pixel centres at integers
 * groundtruth.txt (1 kHz): t tx ty tz qx qy qz qw, camera to world, metres; x right, y down, z forward; the world is the first camera
 * velocity.txt (1 kHz): t vx vy vz wx wy wz in the camera's frame, m/s and rad/s, from the closed form of the path

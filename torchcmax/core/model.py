@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -54,7 +55,7 @@ class Displacement:
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(ABC):
     """Parameters x [A, P] in pixels of displacement over the window; row i belongs to window owner[i].
 
     focal px | normal [W, 3]: the known plane of every window in the frame of its first event, None where it isn't known
@@ -67,9 +68,9 @@ class Model:
     """Whether the plane is among the parameters, so that it has a twin."""
     has_plane: ClassVar[bool] = True
 
+    @abstractmethod
     def displacement(self, x: Tensor, owner: Tensor) -> Displacement:
         """The motion in the frame of the camera at the window's first event."""
-        raise NotImplementedError
 
     def at_reference(self, x: Tensor, owner: Tensor, reference: float) -> Displacement:
         """The same motion in the frame of the camera at `reference`, a share of the window."""
@@ -79,9 +80,9 @@ class Model:
         """H_k [A, K, 3, 3] of the warp to the camera at `reference`."""
         return self.at_reference(x, owner, reference).homography()
 
+    @abstractmethod
     def parameters(self, displacement: Displacement) -> Tensor:
         """The x that `displacement` gives back as this motion, as far as the model has it: [A, P]."""
-        raise NotImplementedError
 
     def _wall(self, x: Tensor, owner: Tensor) -> Tensor:
         return x.new_tensor([0.0, 0.0, -1.0]).expand(len(x), 3) if self.normal is None else self.normal.to(x)[owner]

@@ -80,7 +80,7 @@ def _folder(folder: Path, options: OpenOptions) -> Recording:
         if (folder / "events.txt").is_file():
             text = f"{folder}: holds events.h5 and events.txt; events.txt is ignored, to read it give its own path"
             warnings.warn(DataWarning(text), stacklevel=3)
-        return _hdf5(folder / "events.h5", options)
+        return _hdf5(folder / "events.h5", options, folder)
     if (folder / "events.txt").is_file():
         return _text(folder, folder / "events.txt", folder.resolve().name, options)
     names = sorted(entry.name for entry in folder.iterdir())
@@ -98,11 +98,11 @@ def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: s
     return Recording(path, name, camera, lambda: checked(raw(), source), None, *_truth(folder), guessed)
 
 
-def _hdf5(path: Path, options: OpenOptions) -> Recording:
-    """A recording in an HDF5 file.  The files beside it go before what stands in it, but for our own layout, which is complete."""
+def _hdf5(path: Path, options: OpenOptions, folder: Path | None = None) -> Recording:
+    """A recording in an HDF5 file.  The files of the folder go before what stands in it, unless our own file is opened by itself."""
     contents = read_contents(path)
+    folder = path.parent if folder is None and not contents.own else folder
     raw = partial(read_events, path, options.chunk)
-    folder = None if contents.own else path.parent
     camera, guessed = _camera(folder, contents, str(path), options, raw)
     beside = (None, None) if folder is None else _truth(folder)
     truth, plane = beside[0] or contents.truth, beside[1] or contents.plane
