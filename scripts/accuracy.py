@@ -40,10 +40,10 @@ def whole(folder: Path) -> tuple[Camera, Window]:
 def from_random_starts(window: Window, camera: Camera, model: Model, count: int = 50) -> Minimum:
     """The best that a search from random displacements of up to 40 px finds in one window."""
     look, search = Look(), Search()
-    canvas = Canvas.around(camera, search.margin)
+    view = look.at(window, Canvas.around(camera, search.margin), search.blur[-1])
     x = 80 * (torch.rand(count, model.size, generator=torch.Generator().manual_seed(0)) - 0.5)
-    for sigma in search.blur:
-        every = round_of(look, model, look.coarsely_at(window, canvas, sigma), x, search.stop)
+    for part in (*(view.blurred(sigma) for sigma in search.blur[:-1]), view):
+        every = round_of(look, model, part, x, search.stop)
         x = every.x
     return best_of(every, 1)
 

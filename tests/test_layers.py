@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 LAYER = {
-    "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "board": 3, "rig": 3,
+    "kernels": 0, "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "board": 3, "rig": 3,
     "config": 4, "report": 4, "batch": 4, "cli": 5,
 }  # fmt: skip
 ABOVE = {("simulator", "texture"), ("simulator", "sensor")}  # three files of one thing

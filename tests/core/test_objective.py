@@ -4,7 +4,7 @@ import torch
 from torchcmax.core.camera import Canvas
 from torchcmax.core.contrast import CONTRASTS
 from torchcmax.core.model import Planar, PlanarKnown, Rotation, Translation
-from torchcmax.core.objective import REFERENCES, RIDGE, SAMPLES, ContrastName, Look, deformation, metric, objective, penalty
+from torchcmax.core.objective import REFERENCES, RIDGE, ContrastName, Look, deformation, metric, objective, penalty
 from torchcmax.core.window import Window
 
 CANVAS = Canvas(30.0, (23.3, 17.7), (36, 48))
@@ -109,12 +109,12 @@ def test_deformation_is_the_change_of_a_small_triangle():
 @KINDS
 def test_the_metric_measures_how_far_a_step_moves_the_events(window, kind):
     look, model, owner = Look(), kind(30.0), torch.tensor([0, 1])
-    ink = look.at(window, CANVAS, 0.0).ink
+    ink = look.at(window, CANVAS, 0.0).some
     x = torch.ones(2, kind.size, dtype=torch.float64)
     G = metric(look, model, ink, x, owner)
     ridge = RIDGE * G.diagonal(dim1=1, dim2=2).mean(-1)[:, None, None] / (1 + RIDGE) * torch.eye(kind.size)
     step = 1e-3 * torch.arange(1, kind.size + 1, dtype=torch.float64).expand(2, -1)
-    basis = ink.sample(SAMPLES).basis
+    basis = ink.basis
 
     def place(x):
         ray = model.homography(x, owner, 0.5).transpose(1, 2).flatten(2) @ basis
@@ -140,7 +140,7 @@ def test_padding_changes_neither_the_metric_nor_the_guard(window):
     results = []
     for some in (window, spare):
         view = look.at(some, CANVAS, 1.0)
-        results.append((metric(look, model, view.ink, x, owner), *objective(look, model, view, owner)(x, owner)))
+        results.append((metric(look, model, view.some, x, owner), *objective(look, model, view, owner)(x, owner)))
     for padded, plain in zip(*results, strict=True):
         torch.testing.assert_close(padded, plain)
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import torch
 from torch import Tensor
+
+from torchcmax.kernels import NEAREST
 
 MODELS = {"plumb_bob": 5, "kannala_brandt": 4}
 SMALLEST = 8  # px: a canvas does not become smaller
@@ -103,6 +107,7 @@ class Canvas:
     focal: float
     centre: tuple[float, float]
     size: tuple[int, int]
+    sphere: ClassVar[bool] = False
 
     @classmethod
     def around(cls, camera: Camera, margin: float = 0.25) -> Canvas:
@@ -120,6 +125,76 @@ class Canvas:
         height, width = (max(SMALLEST, round(n * factor)) for n in self.size)
         return Canvas(self.focal * factor, (x, y), (height, width))
 
+    def sees(self, ray: Tensor) -> Tensor:
+        """Which rays are in front: ray [..., 3] -> bool [...]."""
+        return ray[..., 2] > NEAREST
+
     def pixels(self, ray: Tensor) -> Tensor:
         """Rays to image points: ray [..., 3], z > 0 -> [..., 2] px."""
         return ray[..., :2] / ray[..., 2:] * self.focal + ray.new_tensor(self.centre)
+
+    def folded(self, image: Tensor) -> Tensor:
+        """What remains of votes into a frame that is one pixel wider on all sides: [A, H + 2, W + 2] -> [A, H, W]."""
+        return image[:, 1:-1, 1:-1]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """All directions around a camera, equirectangular: H rows from straight up to straight down, 2 H columns round.
+
+    The middle of the image looks along z, x to the right and y down as in a pinhole image; columns are azimuth, rows elevation.
+    """
+
+    height: int
+    sphere: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.height < SMALLEST:
+            raise ValueError(f"a sphere wants at least {SMALLEST} rows, got {self.height}")
+
+    @classmethod
+    def around(cls, camera: Camera) -> Sphere:
+        """Its pixels are as wide as the sensor's in the middle of the image."""
+        return cls(max(SMALLEST, round(math.pi * (camera.fx * camera.fy) ** 0.5)))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.height, 2 * self.height
+
+    @property
+    def focal(self) -> float:
+        """px per radian."""
+        return self.height / math.pi
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """px, of the direction (0, 0, 1)."""
+        return self.height - 0.5, (self.height - 1) / 2
+
+    def scaled(self, factor: float) -> Sphere:
+        """The same view in a smaller image."""
+        return Sphere(max(SMALLEST, round(self.height * factor)))
+
+    def sees(self, ray: Tensor) -> Tensor:
+        """Which rays have a direction: ray [..., 3] -> bool [...].  Straight up and down has an elevation, but no azimuth."""
+        return ray[..., ::2].abs().amax(-1) > torch.finfo(ray.dtype).tiny ** 0.5
+
+    def pixels(self, ray: Tensor) -> Tensor:
+        """Directions to image points: ray [..., 3] -> [..., 2] px, the columns from -0.5 to W - 0.5."""
+        x, y, z = ray.unbind(-1)
+        around = (x * x + z * z).sqrt()
+        return torch.stack([torch.atan2(x, z), torch.atan2(y, around)], -1) * self.focal + ray.new_tensor(self.centre)
+
+    def folded(self, image: Tensor) -> Tensor:
+        """Votes beyond a seam belong to its other side, those beyond a pole half way round: [A, H + 2, W + 2] -> [A, H, W]."""
+        half = self.height
+        rows = image[:, :, 1:-1].clone()
+        rows[:, :, -1] += image[:, :, 0]
+        rows[:, :, 0] += image[:, :, -1]
+        result = rows[:, 1:-1].clone()
+        result[:, 0] += rows[:, 0].roll(half, -1)
+        result[:, -1] += rows[:, -1].roll(half, -1)
+        return result
+
+
+Screen = Canvas | Sphere

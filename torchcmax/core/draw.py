@@ -2,97 +2,117 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchcmax.core.camera import Canvas
-from torchcmax.core.vote import slopes, vote_scatter, votes
+from torchcmax import kernels
+from torchcmax.core.camera import Screen
+from torchcmax.core.vote import vote, vote_scatter
 from torchcmax.core.warp import TERMS, monomials, warp
 from torchcmax.core.window import Window
 
 ALIGNED = 16  # windows are padded to a multiple, since a matrix product rounds otherwise where rows begin off a cache line
-NEAREST = 1e-3  # depth of a warped ray below which it counts as behind the camera
 
 
 @dataclass(frozen=True)
 class Ink:
-    """Windows made ready for many warps: basis [W, 3K, N] of `monomials` | weight [W, N], 0 for padding."""
+    """Windows made ready for many warps: ray (x, y, 1), time s from the reference in window lengths, weight; all [W, N].
 
-    basis: Tensor
+    The weight is 0 for padding.
+    """
+
+    x: Tensor
+    y: Tensor
+    s: Tensor
     weight: Tensor
 
     @classmethod
     def of(cls, window: Window, weight: Tensor, reference: float = 0.5) -> Ink:
         """weight [W, N] that events vote with | reference: the time warped to, 0 the window's first event, 1 its last."""
-        basis = monomials(window.ray, window.phase - reference, TERMS)
-        spare = (0, -weight.shape[-1] % ALIGNED)
-        return cls(pad(basis, spare), pad(weight, spare))
+        return cls(window.ray[..., 0], window.ray[..., 1], window.phase - reference, weight)._aligned()
+
+    def _aligned(self) -> Ink:
+        spare = (0, -self.weight.shape[-1] % ALIGNED)
+        parts = (getattr(self, f.name) for f in fields(self))
+        return Ink(*(pad(part, spare) if spare[1] else part.contiguous() for part in parts))
+
+    def __getitem__(self, index: slice | Tensor) -> Ink:
+        """Some of the windows."""
+        return Ink(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def thinned(self, step: int) -> Ink:
+        """Every step-th event of each window."""
+        return Ink(*(getattr(self, f.name)[:, ::step] for f in fields(self)))._aligned() if step > 1 else self
 
     def sample(self, count: int) -> Ink:
         """`count` events of each window, evenly from its first to its last; repeated where a window has fewer."""
         events = (self.weight != 0).sum(-1, keepdim=True)
         index = (torch.arange(count, device=events.device) * events).div(count, rounding_mode="floor")
-        basis = self.basis.gather(-1, index[:, None].expand(-1, self.basis.shape[1], -1))
-        return Ink(basis, self.weight.gather(-1, index))
+        return Ink(*(getattr(self, f.name).gather(-1, index) for f in fields(self)))
+
+    @cached_property
+    def ray(self) -> Tensor:
+        """[W, 3, N]"""
+        return torch.stack([self.x, self.y, torch.ones_like(self.x)], 1)
+
+    @cached_property
+    def basis(self) -> Tensor:
+        """[W, 3K, N] of `monomials`, for the plain torch path."""
+        return monomials(self.ray.mT, self.s, TERMS)
 
 
-def draw_twin(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
+def draw_twin(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
     """The readable twin of `draw`, in plain torch operations."""
-    ray = warp(H_k, ink.basis[owner]).mT
-    ahead = ray[..., 2] > NEAREST
-    xy = canvas.pixels(torch.where(ahead[..., None], ray, ray.new_ones(3)))
-    return vote_scatter(xy, ink.weight[owner] * ahead, canvas.size)
+    return canvas.folded(_framed(vote_scatter, H_k, ink.basis[owner], ink.weight[owner], canvas))
 
 
-def draw(H_k: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
+def draw(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
     """Warp events and vote them into images, eq. (2.1): one image for each homography.
 
     H_k [A, K, 3, 3] | ink of W windows | owner [A] int: the window that each homography belongs to -> [A, H, W]
 
     Differentiable to H_k, once. On the CPU each row is computed by itself, in the cache and the same in any batch.
     """
-    if ink.basis.is_cuda and torch.are_deterministic_algorithms_enabled():
+    if ink.x.is_cuda and torch.are_deterministic_algorithms_enabled():
         return draw_twin(H_k, ink, canvas, owner)
-    image: Tensor = _Draw.apply(H_k.transpose(1, 2).flatten(2), ink, canvas, owner)
+    if kernels.drawing(ink.x) is not None:
+        return canvas.folded(_Kernel.apply(H_k, ink, canvas, owner))
+    rows = [(H_k, ink.basis[owner], ink.weight[owner])]
+    if not ink.x.is_cuda:
+        rows = [(H_k[i : i + 1].clone(), ink.basis[w : w + 1], ink.weight[w : w + 1]) for i, w in enumerate(owner.tolist())]
+    return canvas.folded(torch.cat([_framed(vote, *row, canvas) for row in rows]))
+
+
+def _framed(how: Any, H_k: Tensor, basis: Tensor, weight: Tensor, canvas: Screen) -> Tensor:
+    """Votes into a frame that is one pixel wider on all sides than the canvas, -> [A, H + 2, W + 2]."""
+    ray = warp(H_k, basis).mT
+    seen = canvas.sees(ray)
+    xy = canvas.pixels(torch.where(seen[..., None], ray, ray.new_ones(3)))
+    image: Tensor = how(xy + 1, weight * seen, (canvas.size[0] + 2, canvas.size[1] + 2))
     return image
 
 
-def _portions(ink: Ink, owner: Tensor) -> list[tuple[slice, Tensor, Tensor]]:
-    """Rows to compute together, with their basis and weight: one at a time on the CPU, all at once on a GPU."""
-    if ink.basis.is_cuda:
-        return [(slice(None), ink.basis[owner], ink.weight[owner])]
-    return [(slice(i, i + 1), ink.basis[w : w + 1], ink.weight[w : w + 1]) for i, w in enumerate(owner.tolist())]
+class _Kernel(torch.autograd.Function):
+    """`_framed` by the kernels of a device, for all rows at once."""
 
-
-def _project(flat: Tensor, basis: Tensor, weight: Tensor, canvas: Canvas) -> tuple[Tensor, Tensor, Tensor]:
-    """flat [A, 3, 3K] -> focal / depth [A, 1, N], offset from the canvas' centre [A, 2, N] px, weight [A, N] or 0 if behind."""
-    ray = flat.clone() @ basis  # a copy begins on a cache line, see ALIGNED
-    ahead = ray[:, 2:] > NEAREST
-    scale = canvas.focal / torch.where(ahead, ray[:, 2:], 1.0)
-    return scale, ray[:, :2] * scale, weight * ahead[:, 0]
-
-
-class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, flat: Tensor, ink: Ink, canvas: Canvas, owner: Tensor) -> Tensor:
-        image, projected = flat.new_empty(len(flat), *canvas.size), []
-        for rows, basis, weight in _portions(ink, owner):
-            scale, offset, weight = _project(flat[rows], basis, weight, canvas)
-            image[rows] = votes(offset.mT + flat.new_tensor(canvas.centre), weight, canvas.size)
-            projected.append((rows, basis, weight, scale, offset))
-        ctx.canvas, ctx.projected = canvas, projected
+    def forward(ctx: Any, H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
+        ctx.save_for_backward(H_k, owner)
+        ctx.ink, ctx.canvas = ink, canvas
+        image: Tensor = _kernel(ink).votes(H_k, ink, canvas, owner)
         return image
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        result = []
-        for rows, basis, weight, scale, offset in ctx.projected:
-            slope = slopes(gradient[rows], offset.mT + offset.new_tensor(ctx.canvas.centre), weight).mT
-            to_ray = torch.cat([slope, -(slope * offset).sum(1, keepdim=True) / ctx.canvas.focal], 1) * scale
-            result.append(to_ray @ basis.mT)
-        return torch.cat(result), None, None, None
+        H_k, owner = ctx.saved_tensors
+        return _kernel(ctx.ink).slopes(H_k, ctx.ink, ctx.canvas, owner, gradient), None, None, None
+
+
+def _kernel(ink: Ink) -> Any:
+    return kernels.drawing(ink.x)

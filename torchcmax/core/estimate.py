@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from torchcmax.core.camera import Camera, Canvas
-from torchcmax.core.minimize import Minimum, Stop, minimize
+from torchcmax.core.minimize import Minimum, Stop
 from torchcmax.core.model import Displacement, Model
-from torchcmax.core.objective import REFERENCES, Look, View, metric, objective
+from torchcmax.core.objective import REFERENCES, Look, View, minimum, penalty
 from torchcmax.core.pose import Motion
+from torchcmax.core.warp import TERMS, still
 from torchcmax.core.window import Window
 
+COARSE = 8.0  # a blurred round is done when a step is shorter than so many tolerances for each px of blur
 WIDEST = 32.0  # px: blur beyond it leaves nothing of an image
 
 
@@ -23,7 +25,7 @@ class Search:
     """How the sharpest image is searched for."""
 
     blur: tuple[float, ...] = (4.0, 2.0, 1.0)
-    """Gaussian blur in px, one round each, coarse to fine; a round with blur b takes every b-th event."""
+    """Gaussian blur in px, one round each, coarse to fine; with blur b every b-th event and pixel are taken, in the last round all."""
     start: float = 0.0
     """px: besides at rest, begin with this displacement right, left, down and up; 0: at rest alone."""
     margin: float = 0.25
@@ -73,28 +75,25 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
     """The motion that makes each window sharpest; every window by itself, all in one batch.
 
     A round begins where the last one ended: the best of the starts after the first, and before the last one both
-    decompositions of a free plane.
+    decompositions of a free plane.  What is not sharper than no motion is searched for again from there.
     """
     if not len(window):
         raise ValueError("estimate wants at least one window, got none")
     look, search = look or Look(), search or Search()
-    canvas = Canvas.around(camera, search.margin)
-    x = starts(window, model, search.start)
-    iterations = evaluations = torch.zeros(len(window), dtype=torch.int64, device=x.device)
-    traces = []
-    for index, sigma in enumerate(search.blur):
-        view = look.coarsely_at(window, canvas, sigma)
-        if 0 < index == len(search.blur) - 1:
-            x = last_starts(look, model, view, x)
-        every = round_of(look, model, view, x, search.stop)
-        iterations = iterations + every.iterations.view(len(window), -1).sum(-1)
-        evaluations = evaluations + every.evaluations.view(len(window), -1).sum(-1)
-        found = best_of(every, len(window))
-        traces.append((-found.trace).exp())
-        x = found.x
-    found = replace(found, iterations=iterations, evaluations=evaluations)
-    result = _report(window, model, look, look.at(window, canvas, search.blur[-1]), found)
-    return replace(result, traces=tuple(traces))
+    view = look.at(window, Canvas.around(camera, search.margin), search.blur[-1])
+    owner = torch.arange(len(window), device=window.ray.device)
+    zero = look.sharpness(still(window.ray.new_empty(len(window), TERMS, 3, 3)), view, owner)
+    x, rounds = starts(window, model, search.start), []
+    for sigma in search.blur[:-1]:
+        stop = replace(search.stop, tolerance=search.stop.tolerance * max(1.0, COARSE * sigma))
+        rounds.append(best_of(round_of(look, model, view.blurred(sigma), x, stop), len(window)))
+        x = rounds[-1].x
+    found = best_of(round_of(look, model, view, with_twin(model, look, x), search.stop), len(window))
+    worse = (~(found.value <= -zero.log())).nonzero()[:, 0]
+    if len(worse):
+        part = replace(model, normal=None if model.normal is None else model.normal[worse])
+        found = _mended(found, worse, round_of(look, part, view[worse], torch.zeros_like(x[worse]), search.stop))
+    return _report(window, model, look, view, [*rounds, found], zero)
 
 
 def starts(window: Window, model: Model, far: float) -> Tensor:
@@ -105,17 +104,11 @@ def starts(window: Window, model: Model, far: float) -> Tensor:
     return x.repeat(len(window), 1)
 
 
-def last_starts(look: Look, model: Model, view: View, x: Tensor) -> Tensor:
-    """What the coarse rounds found, or rest where rest is sharper (they see fewer events); and the twin of a free plane.
-
-    x [B, P] -> [B * C, P] with C = 2 candidates for each window, of models with a free plane, or 1.
-    """
-    owner, reference = torch.arange(len(x), device=x.device), REFERENCES[look.reference]
-    with torch.no_grad():
-        here, rest = (look.sharpness(model.homography(p, owner, reference), view, owner) for p in (x, torch.zeros_like(x)))
-    x = torch.where((here > rest)[:, None], x, 0.0)
+def with_twin(model: Model, look: Look, x: Tensor) -> Tensor:
+    """What the coarse rounds found, and of a free plane its other decomposition: x [B, P] -> [B * C, P], C = 1 or 2."""
     if not model.free_plane:
         return x
+    owner, reference = torch.arange(len(x), device=x.device), REFERENCES[look.reference]
     twin = model.displacement(x, owner).seen_at(reference).twin().seen_at(-reference)
     return torch.stack([x, model.parameters(twin)], 1).flatten(0, 1)
 
@@ -124,14 +117,27 @@ def round_of(look: Look, model: Model, view: View, x: Tensor, stop: Stop | None 
     """One round of the search, from C candidates for each window of the view: x [B * C, P]."""
     windows = len(view.ink.weight)
     owner = torch.arange(windows, device=x.device).repeat_interleave(len(x) // windows)
-    return minimize(objective(look, model, view, owner), x, metric(look, model, view.ink, x, owner), stop)
+    return minimum(look, model, view, owner)(x, stop)
 
 
 def best_of(every: Minimum, windows: int) -> Minimum:
-    """The lowest of each window's candidates: B * C rows -> B rows."""
+    """The lowest of each window's candidates, with the work of all: B * C rows -> B rows."""
+    if len(every.x) == windows:
+        return every
     value = every.value.view(windows, -1).nan_to_num(torch.inf)
     best = value.argmin(-1) + value.shape[1] * torch.arange(windows, device=value.device)
-    return Minimum(*(getattr(every, f.name)[best] for f in fields(every)))
+    found = Minimum(*(getattr(every, f.name)[best] for f in fields(every)))
+    iterations, evaluations = (n.view(windows, -1).sum(-1) for n in (every.iterations, every.evaluations))
+    return replace(found, iterations=iterations, evaluations=evaluations)
+
+
+def _mended(found: Minimum, rows: Tensor, again: Minimum) -> Minimum:
+    """Some rows searched for once more; the work of both counts, the trace is that of the first."""
+    iterations, evaluations = found.iterations.clone(), found.evaluations.clone()
+    iterations[rows] += again.iterations
+    evaluations[rows] += again.evaluations
+    x, value, converged = (getattr(found, n).index_copy(0, rows, getattr(again, n)) for n in ("x", "value", "converged"))
+    return replace(found, x=x, value=value, converged=converged, iterations=iterations, evaluations=evaluations)
 
 
 def rates(displacement: Displacement, window: Window) -> Motion:
@@ -140,22 +146,23 @@ def rates(displacement: Displacement, window: Window) -> Motion:
     return Motion(displacement.turn * per_second, displacement.shift * per_second)
 
 
-def _report(window: Window, model: Model, look: Look, view: View, found: Minimum) -> Estimate:
+def _report(window: Window, model: Model, look: Look, view: View, rounds: list[Minimum], zero: Tensor) -> Estimate:
     """The last minimum of every window, in units that people read, with the contrast that all its events have."""
-    owner = torch.arange(len(window), device=found.x.device)
-    x = torch.where((window.duration > 0)[:, None], found.x, 0.0)  # events that come all at once show no motion
-    with torch.no_grad():
-        H_k, H_zero = (model.homography(p, owner, REFERENCES[look.reference]) for p in (x, torch.zeros_like(x)))
-        contrast, zero = (look.sharpness(H, view, owner) for H in (H_k, H_zero))
-        displacement = model.displacement(x, owner)
+    found, seen = rounds[-1], window.duration > 0  # events that come all at once show no motion
+    owner, reference = torch.arange(len(window), device=zero.device), REFERENCES[look.reference]
+    x = torch.where(seen[:, None], found.x, 0.0)
+    there = model.at_reference(x, owner, reference)
+    H_k = there.homography()
+    cost = penalty(look, model, there, H_k, view.some.ray)
+    displacement = model.displacement(x, owner)
     return Estimate(
         motion=rates(displacement, window),
         normal=displacement.normal if model.has_plane else None,
         H_k=H_k,
         contrast_zero=zero,
-        contrast=contrast,
-        iterations=found.iterations,
-        evaluations=found.evaluations,
-        converged=found.converged & (window.duration > 0),
-        traces=(),
+        contrast=torch.where(seen, (cost - found.value).exp(), zero),
+        iterations=torch.stack([r.iterations for r in rounds]).sum(0),
+        evaluations=torch.stack([r.evaluations for r in rounds]).sum(0),
+        converged=found.converged & seen,
+        traces=tuple((-r.trace).exp() for r in rounds),
     )

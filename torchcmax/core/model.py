@@ -84,7 +84,8 @@ class Model(ABC):
     def parameters(self, displacement: Displacement) -> Tensor:
         """The x that `displacement` gives back as this motion, as far as the model has it: [A, P]."""
 
-    def _wall(self, x: Tensor, owner: Tensor) -> Tensor:
+    def wall(self, x: Tensor, owner: Tensor) -> Tensor:
+        """The known plane of each row, or the fronto-parallel one: -> normal [A, 3]."""
         return x.new_tensor([0.0, 0.0, -1.0]).expand(len(x), 3) if self.normal is None else self.normal.to(x)[owner]
 
 
@@ -95,7 +96,7 @@ class Rotation(Model):
     has_plane = False
 
     def displacement(self, x: Tensor, owner: Tensor) -> Displacement:
-        return Displacement(x / self.focal, torch.zeros_like(x), self._wall(x, owner))
+        return Displacement(x / self.focal, torch.zeros_like(x), self.wall(x, owner))
 
     def at_reference(self, x: Tensor, owner: Tensor, reference: float) -> Displacement:
         return self.displacement(x, owner)  # a turn is the same in the frame of every moment
@@ -110,7 +111,7 @@ class Translation(Model):
     size = 3
 
     def displacement(self, x: Tensor, owner: Tensor) -> Displacement:
-        return Displacement(torch.zeros_like(x), x / self.focal, self._wall(x, owner))
+        return Displacement(torch.zeros_like(x), x / self.focal, self.wall(x, owner))
 
     def parameters(self, displacement: Displacement) -> Tensor:
         return displacement.shift * self.focal
@@ -122,7 +123,7 @@ class PlanarKnown(Model):
     size = 6
 
     def displacement(self, x: Tensor, owner: Tensor) -> Displacement:
-        return Displacement(x[:, :3] / self.focal, x[:, 3:] / self.focal, self._wall(x, owner))
+        return Displacement(x[:, :3] / self.focal, x[:, 3:] / self.focal, self.wall(x, owner))
 
     def parameters(self, displacement: Displacement) -> Tensor:
         return torch.cat([displacement.turn, displacement.shift], -1) * self.focal

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from torchcmax.core.camera import Canvas
+from torchcmax import kernels
+from torchcmax.core.camera import NEAREST, Canvas
 from torchcmax.core.contrast import CONTRASTS, blur, normalized
-from torchcmax.core.draw import NEAREST, Ink, draw
-from torchcmax.core.minimize import Objective
-from torchcmax.core.model import Displacement, Model
+from torchcmax.core.draw import Ink, draw
+from torchcmax.core.minimize import Minimum, Objective, Stop, minimize
+from torchcmax.core.model import CLOSEST, Displacement, Model, Planar, PlanarKnown, Rotation, Translation
+from torchcmax.core.warp import TERMS
 from torchcmax.core.window import Window
 
 REFERENCES = {"first": 0.0, "middle": 0.5}
@@ -51,26 +54,39 @@ class Look:
     def at(self, window: Window, canvas: Canvas, sigma: float) -> View:
         """All events of the window on the canvas, blurred by sigma px."""
         weight = window.polarity if self.polarity == "signed" else window.weight
-        return View(Ink.of(window, weight, REFERENCES[self.reference]), canvas, sigma)
-
-    def coarsely_at(self, window: Window, canvas: Canvas, sigma: float) -> View:
-        """The same for less work: under a blur of sigma px every sigma-th event will do, and pixels of sigma / 2."""
-        factor = min(1.0, 2 / sigma) if sigma else 1.0
-        return self.at(window.thinned(max(1, int(sigma))), canvas.scaled(factor), sigma * factor)
+        ink = Ink.of(window, weight, REFERENCES[self.reference])
+        return View(ink, canvas, sigma, ink.sample(SAMPLES))
 
     def sharpness(self, H_k: Tensor, view: View, owner: Tensor) -> Tensor:
         """Normalized contrast of the image of warped events: H_k [A, K, 3, 3] | owner [A] -> [A]."""
+        kernel = kernels.searching(view.ink.x)
+        if kernel is not None and not H_k.requires_grad:
+            values: Tensor = kernel.sharpness(H_k, view, owner, self.contrast)
+            return values
         image = normalized(draw(H_k, view.ink, view.canvas, owner), view.ink.weight[owner])
         return CONTRASTS[self.contrast](blur(image, view.sigma))
 
 
 @dataclass(frozen=True)
 class View:
-    """Windows made ready for many warps, where they are drawn, and the blur of the image in canvas px."""
+    """Windows made ready for many warps, where they are drawn, the blur of the image in canvas px, and a few of the events.
+
+    some: enough of them to measure how far a step moves a window, and to watch over it
+    """
 
     ink: Ink
     canvas: Canvas
     sigma: float
+    some: Ink
+
+    def __getitem__(self, index: Tensor) -> View:
+        """Some of the windows."""
+        return View(self.ink[index], self.canvas, self.sigma, self.some[index])
+
+    def blurred(self, sigma: float) -> View:
+        """Looked at through a blur of sigma px, for less work: every sigma-th event will do, and pixels of sigma px."""
+        factor = max(1.0, sigma)
+        return View(self.ink.thinned(int(factor)), self.canvas.scaled(1 / factor), sigma / factor, self.some)
 
 
 def deformation(there: Displacement, H_k: Tensor, ray: Tensor, reference: float) -> Tensor:
@@ -106,7 +122,7 @@ def penalty(look: Look, model: Model, there: Displacement, H_k: Tensor, ray: Ten
 
 def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
     """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to."""
-    ray = view.ink.sample(SAMPLES).basis[:, :3]
+    ray = view.some.ray
 
     def evaluate(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_()
@@ -121,13 +137,13 @@ def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
     return evaluate
 
 
-def metric(look: Look, model: Model, ink: Ink, x: Tensor, owner: Tensor) -> Tensor:
-    """Squared length of a step in px of the events' own flow: mean of J^T J over some events, J = d pixel / d x, -> [A, P, P].
+def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Tensor:
+    """Squared length of a step in px of the events' own flow: mean of J^T J over `some` events, J = d pixel / d x, -> [A, P, P].
 
     In it one unit moves the events by 1 px rms, and rotation and translation, nearly collinear, come apart. The ridge gives a
     length to what moves nothing (the tilt of a plane before which nothing moves yet).
     """
-    parameters, some = x.shape[-1], ink.sample(SAMPLES)
+    parameters, events = x.shape[-1], some.x.shape[-1]
     steps = torch.eye(parameters).to(x)
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
     each = owner.repeat_interleave(2 * parameters)
@@ -135,6 +151,27 @@ def metric(look: Look, model: Model, ink: Ink, x: Tensor, owner: Tensor) -> Tens
     ray = (flat[..., None] * some.basis[each][:, None]).sum(2)  # no matrix products here, which round differently in another batch
     flow = (ray[:, :2] / ray[:, 2:].clamp_min(NEAREST) * model.focal).view(len(x), 2, parameters, -1)
     J = (flow[:, 0] - flow[:, 1]) / 2 * (some.weight[owner] != 0).to(x)[:, None].repeat(1, 1, 2)
-    G = (J[:, :, None] * J[:, None]).sum(-1) / SAMPLES
+    G = (J[:, :, None] * J[:, None]).sum(-1) / events
     mean = G.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(x.dtype).eps)
     return G + RIDGE * mean[:, None, None] * torch.eye(parameters).to(x)
+
+
+IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order of kernels/search.py
+
+
+def minimum(look: Look, model: Model, view: View, owner: Tensor) -> Callable[[Tensor, Stop | None], Minimum]:
+    """The way to the minimum of `objective` from x [B, P], measured by `metric`: in machine code where there is some for it.
+
+    Models of others, and other devices, go through `minimize`.
+    """
+    kernel = kernels.searching(view.ink.x)
+    if kernel is None or type(model) not in IN_MACHINE_CODE:
+        return lambda x, stop: minimize(objective(look, model, view, owner), x, metric(look, model, view.some, x, owner), stop)
+    sought = kernel.Look(
+        model=IN_MACHINE_CODE.index(type(model)), focal=model.focal, reference=REFERENCES[look.reference],
+        contrast=list(CONTRASTS).index(look.contrast), deformation=look.deformation, guard=look.guard, tilt=look.tilt,
+        closest=CLOSEST, grazing=GRAZING, nearest=NEAREST, ridge=RIDGE,
+    )  # fmt: skip
+    known = model.wall(view.ink.x, torch.arange(len(view.ink.x)))
+    problem = kernel.Problem(view, known, sought, TERMS)
+    return lambda x, stop: Minimum(*kernel.search(problem, x, owner, stop or Stop()))

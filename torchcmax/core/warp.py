@@ -42,6 +42,13 @@ def polynomial(turn: Tensor, shift: Tensor, normal: Tensor, terms: int = TERMS) 
     return torch.cat([series[:, :1], series[:, 1:] + line[:, None] @ series[:, :-1]], 1)
 
 
+def still(like: Tensor) -> Tensor:
+    """The homographies that leave every ray where it is, as many as there are: like [B, K, 3, 3] -> H_k [B, K, 3, 3]."""
+    H_k = torch.zeros_like(like)
+    H_k[:, 0] = torch.eye(3).to(H_k)
+    return H_k
+
+
 def monomials(ray: Tensor, s: Tensor, terms: int = TERMS) -> Tensor:
     """What a polynomial homography is multiplied with: ray [B, N, 3] | s [B, N] -> [B, 3K, N], row 3k + i is s^k ray_i."""
     rows = [ray.mT]

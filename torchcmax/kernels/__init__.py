@@ -1,0 +1,62 @@
+"""Fast twins of core/draw.py and of the search, chosen by where tensors are; without them everything works, slower."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+from functools import lru_cache
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+log = logging.getLogger("torchcmax")
+NEAREST = 1e-3  # depth of a ray below which it counts as behind the camera
+SWITCH = "TORCHCMAX_KERNELS"  # environment: 0 leaves the kernels out, to compare with
+_threads = 0
+
+
+def threads() -> int:
+    """Threads that the CPU's kernels use: those of torch unless `set_threads` said otherwise."""
+    return _threads or torch.get_num_threads()
+
+
+def set_threads(count: int) -> None:
+    """Let the CPU's kernels use so many threads; 0: as many as torch."""
+    global _threads
+    if count < 0:
+        raise ValueError(f"a number of threads is at least 0, got {count}")
+    _threads = count
+
+
+def drawing(like: Tensor) -> ModuleType | None:
+    """The module with `votes` and `slopes` for tensors like this one, None where there is none."""
+    if os.environ.get(SWITCH) == "0" or like.dtype not in (torch.float32, torch.float64):
+        return None
+    return _cuda() if like.is_cuda else _cpu() if like.device.type == "cpu" else None
+
+
+def searching(like: Tensor) -> ModuleType | None:
+    """The module with `search` and `sharpness` for tensors like this one, None where there is none."""
+    return drawing(like) if like.device.type == "cpu" else None
+
+
+@lru_cache(maxsize=1)
+def _cpu() -> ModuleType | None:
+    if importlib.util.find_spec("numba") is None:
+        log.warning("torchcmax: without numba the CPU is some twenty times slower; get it with: pip install 'torchcmax[fast]'")
+        return None
+    from torchcmax.kernels import cpu
+
+    return cpu
+
+
+@lru_cache(maxsize=1)
+def _cuda() -> ModuleType | None:
+    if importlib.util.find_spec("triton") is None:
+        log.warning("torchcmax: without triton the GPU works slower; get it with: pip install triton")
+        return None
+    from torchcmax.kernels import cuda
+
+    return cuda

@@ -1,0 +1,53 @@
+"""How functions are compiled: by numba, once for this processor, kept on disk."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import event
+
+log = logging.getLogger("torchcmax")
+FAST = {"reassoc", "contract", "arcp", "nsz"}  # sums in any order, fused multiply-add; nan and inf keep their meaning
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """The function as machine code that runs without the interpreter's lock."""
+    options = {"nogil": True, "fastmath": FAST, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder where code could be kept: it is compiled in every process
+        return numba.njit(**options)(function)
+
+
+def forget_stale() -> None:
+    """Drop kept code that is older than any of the sources: numba looks at the file of the outermost function alone."""
+    sources = Path(__file__).parent
+    newest = max(path.stat().st_mtime for path in sources.glob("*.py"))
+    for kept in sources.glob("__pycache__/*.nbi"):
+        with suppress(FileNotFoundError):  # another process does the same
+            if kept.stat().st_mtime < newest:
+                kept.unlink()
+
+
+class _Say(event.Listener):
+    """Says that something is compiled, the first time it happens in a process."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        module = sys.modules.get("torchcmax.kernels.compiling")
+        if not _Say.said and module is not None and str(event.data["dispatcher"].py_func.__module__).startswith("torchcmax."):
+            _Say.said = True
+            log.warning("torchcmax: compiling the kernels for this processor, once; this takes about half a minute")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Say())

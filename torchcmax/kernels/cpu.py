@@ -1,0 +1,159 @@
+"""The CPU's kernels as functions of tensors: drawing, contrast and the search, spread over threads."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcmax import kernels
+from torchcmax.kernels import events, image
+from torchcmax.kernels import search as searching
+from torchcmax.kernels.compiling import forget_stale
+from torchcmax.kernels.search import Look
+
+forget_stale()
+Array = np.ndarray[Any, np.dtype[Any]]
+MOST = 1 << 24  # pixels that float32 tells apart
+PART = 50_000  # events for which a second thread pays, where there is one window
+_own = threading.local()
+
+
+class Problem(NamedTuple):
+    """What `search` minimizes: a view of W windows, known normals [W, 3], the look in numbers.
+
+    terms: of the polynomial homography.
+    """
+
+    view: Any
+    normal: Tensor
+    look: Look
+    terms: int
+
+
+def votes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor) -> Tensor:
+    """Frames of warped events, before `canvas.folded`.
+
+    H_k [A, K, 3, 3] | ink of W windows | owner [A] -> [A, H + 2, W + 2].  The sum of a window that several threads share
+    depends on their number, and on nothing else.
+    """
+    H, rows, lens = _array(H_k.to(ink.x)), _rows(ink), lens_of(canvas, ink.x)
+    parts = _parts(len(H), ink.x.shape[-1])
+    frames = np.zeros((len(parts), len(H), (canvas.size[0] + 2) * (canvas.size[1] + 2)), lens.dtype)
+
+    def work(a: int, window: int, i: int) -> None:
+        events.draw(H[a], rows(window, parts[i]), lens, frames[i, a])
+
+    _spread(work, [(a, window, i) for a, window in enumerate(owner.tolist()) for i in range(len(parts))])
+    return torch.from_numpy(frames.sum(0) if len(parts) > 1 else frames[0]).view(len(H), canvas.size[0] + 2, canvas.size[1] + 2)
+
+
+def slopes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor, gradient: Tensor) -> Tensor:
+    """The derivative of `votes`: gradient = dL/dframe [A, H + 2, W + 2] -> dL/dH_k [A, K, 3, 3]."""
+    H, rows, lens = _array(H_k.to(ink.x)), _rows(ink), lens_of(canvas, ink.x)
+    parts = _parts(len(H), ink.x.shape[-1])
+    frames, totals = _array(gradient).reshape(len(H), -1), np.zeros((len(parts), *H.shape))
+
+    def work(a: int, window: int, i: int) -> None:
+        events.draw_slopes(H[a], rows(window, parts[i]), lens, frames[a], totals[i, a])
+
+    _spread(work, [(a, window, i) for a, window in enumerate(owner.tolist()) for i in range(len(parts))])
+    return torch.from_numpy(totals.sum(0)).to(H_k)
+
+
+def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
+    """Normalized contrast of the blurred image of warped events on a pinhole canvas: H_k [A, K, 3, 3] | owner [A] -> [A]."""
+    H, rows = _array(H_k.to(view.ink.x)), _rows(view.ink)
+    lens, taps, code = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x), image.CONTRASTS.index(contrast)
+    values = np.zeros(len(H))
+
+    def work(a: int, window: int) -> None:
+        values[a] = searching.sharpness(H[a], rows(window), lens, taps, code, *_scratch(view.canvas, taps))
+
+    _spread(work, list(enumerate(owner.tolist())))
+    return torch.from_numpy(values).to(H_k)
+
+
+def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor]:
+    """`core.minimize` of `core.objective`, each row in machine code: x [B, P] | owner [B] -> the fields of a Minimum."""
+    ink, canvas = problem.view.ink, problem.view.canvas
+    start, rows, some = _array(x.double()), _rows(ink), _rows(problem.view.some)
+    lens, taps, normal = lens_of(canvas, ink.x), _taps(problem.view.sigma, ink.x), _array(problem.normal.double())
+    limits = searching.Stop(*(getattr(stop, name) for name in searching.Stop._fields))
+    found: list[Any] = [None] * len(x)
+
+    def work(row: int, window: int) -> None:
+        scene = searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(canvas, taps))
+        found[row] = searching.search(start[row], problem.look, scene, limits, problem.terms)
+
+    _spread(work, list(enumerate(owner.tolist())))
+    *numbers, traces = zip(*found, strict=True)
+    trace = np.full((len(x), max(len(t) for t in traces)), np.nan)
+    for row, values in enumerate(traces):
+        trace[row, : len(values)] = values
+    place, value, iterations, evaluations, converged = (torch.from_numpy(np.array(n)) for n in numbers)
+    return [place.to(x), value.to(x), iterations, evaluations, converged, torch.from_numpy(trace).to(x)]
+
+
+def lens_of(canvas: Any, like: Tensor) -> Array:
+    """How rays meet the frame, in the numbers that kernels/events.py wants."""
+    (height, width), (x, y) = canvas.size, canvas.centre
+    if like.dtype == torch.float32 and (height + 2) * (width + 2) > MOST:
+        raise ValueError(f"a canvas of {height} x {width} px has more than 2^24 pixels, which float32 cannot count; draw in float64")
+    least = torch.finfo(like.dtype).tiny ** 0.5 if canvas.sphere else kernels.NEAREST
+    span = events.SPAN if like.dtype == torch.float32 else 0.0
+    return _array(like.new_tensor([canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, span]))
+
+
+def _array(x: Tensor) -> Array:
+    return x.detach().contiguous().numpy()
+
+
+def _rows(ink: Any) -> Callable[..., tuple[Array, ...]]:
+    """x, y, s, weight of a window, or of a part of it."""
+    arrays = tuple(_array(part) for part in (ink.x, ink.y, ink.s, ink.weight))
+    return lambda window, part=slice(None): tuple(array[window, part] for array in arrays)
+
+
+def _taps(sigma: float, like: Tensor) -> Array:
+    return _array(torch.from_numpy(image.taps(float(sigma))).to(like))
+
+
+def _scratch(canvas: Any, taps: Array) -> tuple[Array, Array]:
+    """Frames and a line that belong to this thread: new memory would cost more than the work in it."""
+    key = (canvas.size, len(taps), taps.dtype)
+    if getattr(_own, "key", None) != key:
+        height, width = canvas.size
+        _own.key = key
+        _own.scratch = np.zeros((3, height + 2, width + 2), taps.dtype), np.zeros(width + 2 * len(taps), taps.dtype)
+    scratch: tuple[Array, Array] = _own.scratch
+    return scratch
+
+
+def _parts(rows: int, count: int) -> list[slice]:
+    """A window is cut where there are fewer windows than threads."""
+    pieces = 1 if rows >= kernels.threads() else max(1, min(kernels.threads() // max(rows, 1), count // PART))
+    edges = [count * i // pieces for i in range(pieces + 1)]
+    return [slice(*edge) for edge in zip(edges, edges[1:], strict=False)]
+
+
+def _spread(work: Callable[..., None], tasks: Sequence[tuple[int, ...]]) -> None:
+    """Do every task, on several threads where there are several."""
+    if min(kernels.threads(), len(tasks)) < 2:
+        for task in tasks:
+            work(*task)
+    else:
+        list(_pool(os.getpid(), kernels.threads()).map(lambda task: work(*task), tasks))
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    """One for each process, as threads do not outlive a fork."""
+    return ThreadPoolExecutor(threads, "torchcmax")
