@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchcmax.core.contrast import CONTRASTS, blur, normalized, variance
+from torchcmax.core.contrast import CONTRASTS, _smooth, blur, normalized, variance
 
 ALL = pytest.mark.parametrize("contrast", CONTRASTS.values(), ids=CONTRASTS)
 
@@ -85,6 +85,12 @@ def test_blur_is_a_gaussian(sigma, dtype, device):
     y, x = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
     gauss = torch.exp(-(x**2 + y**2) / (2 * sigma**2)).to(image)
     torch.testing.assert_close(blur(image, sigma)[0], gauss / gauss.sum(), rtol=0, atol=3e-3 * gauss.sum().reciprocal().item())
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.5])
+def test_blur_is_its_readable_twin_on_every_device_and_in_a_cropped_image(sigma, rand, close):
+    image = rand(3, 27, 34)[:, 1:-1, 1:-1]
+    close(blur(image, sigma), _smooth(_smooth(image, sigma, -2), sigma, -1))
 
 
 def test_blur_is_its_own_adjoint(rand, close):

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchcmax.core.minimize import Stop, minimize
 
@@ -204,3 +205,32 @@ def test_options_that_make_no_sense_are_refused(wrong):
 def test_no_rows_are_no_work():
     found = minimize(rosenbrock, torch.zeros(0, 2, dtype=torch.float64))
     assert found.x.shape == (0, 2)
+
+
+class Waits(TorchDispatchMode):
+    """Counts the operations whose result a program must know before it can go on; on a GPU it waits for them."""
+
+    count = 0
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        indices = args[1] if "index" in str(operation) and len(args) > 1 and isinstance(args[1], list | tuple) else ()
+        by_mask = any(index is not None and index.dtype == torch.bool for index in indices)
+        self.count += by_mask or any(name in str(operation) for name in ("nonzero", "_local_scalar_dense", "equal", "is_same_size"))
+        return operation(*args, **(kwargs or {}))
+
+
+def test_a_round_waits_once_for_a_gpu(problem):
+    A, centre = problem
+    calls = []
+    inner = quadratic(A, centre)
+
+    def counting(x, rows):
+        calls.append(len(rows))
+        return inner(x, rows)
+
+    with Waits() as waits:
+        minimize(counting, torch.zeros_like(centre), A, EXACT)
+        spared = waits.count
+        minimize(rosenbrock, torch.tensor([[-1.2, 1.0]], dtype=torch.float64), stop=Stop(iterations=3))
+    assert spared == len(calls)  # whose rows go on; after the first evaluation too
+    assert waits.count > spared

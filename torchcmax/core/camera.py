@@ -177,7 +177,8 @@ class Sphere:
 
     def sees(self, ray: Tensor) -> Tensor:
         """Which rays have a direction: ray [..., 3] -> bool [...].  Straight up and down has an elevation, but no azimuth."""
-        return ray[..., ::2].abs().amax(-1) > torch.finfo(ray.dtype).tiny ** 0.5
+        least: float = torch.finfo(ray.dtype).tiny ** 0.5
+        return ray[..., ::2].abs().amax(-1) > least
 
     def pixels(self, ray: Tensor) -> Tensor:
         """Directions to image points: ray [..., 3] -> [..., 2] px, the columns from -0.5 to W - 0.5."""
@@ -191,7 +192,7 @@ class Sphere:
         rows = image[:, :, 1:-1].clone()
         rows[:, :, -1] += image[:, :, 0]
         rows[:, :, 0] += image[:, :, -1]
-        result = rows[:, 1:-1].clone()
+        result: Tensor = rows[:, 1:-1].clone()
         result[:, 0] += rows[:, 0].roll(half, -1)
         result[:, -1] += rows[:, -1].roll(half, -1)
         return result

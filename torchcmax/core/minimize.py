@@ -16,7 +16,7 @@ Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 class Stop:
     """When a row is done, and how far it may step.  px are lengths in the metric of `minimize`."""
 
-    tolerance: float = 0.01
+    tolerance: float = 0.005
     """px: a row is done when its full step would be shorter."""
     iterations: int = 40
     """Accepted steps at most."""
@@ -50,59 +50,62 @@ class Minimum:
 
 
 class _Rows:
-    """The state of every row: its point, its curvature, and the bracket of its line search."""
+    """The state of every row: its point, its curvature, and the bracket of its line search.
+
+    Every method works on all rows at once and chooses by masks, so that a GPU needs not be waited for.
+    """
 
     def __init__(self, x: Tensor, value: Tensor, gradient: Tensor, metric: Tensor, stop: Stop) -> None:
         self.x, self.value, self.gradient, self.metric, self.stop = x.clone(), value, gradient, metric, stop
-        self.plain = torch.linalg.inv(metric)  # inverse Hessian as long as nothing is known of the curvature
-        self.inverse = self.plain.clone()
+        self.plain = self.inverse = torch.linalg.inv(metric)  # inverse Hessian as long as nothing is known of the curvature
         self.step = torch.zeros_like(x)
-        self.length, self.limit, self.low, self.high = (torch.zeros_like(value) for _ in range(4))
-        self.iterations, self.trials = (torch.zeros_like(value, dtype=torch.int64) for _ in range(2))
-        self.evaluations = torch.ones_like(self.trials)
+        self.length = self.low = self.high = torch.zeros_like(value)
+        self.iterations = self.trials = torch.zeros_like(value, dtype=torch.int64)
         self.scaled, self.converged = torch.zeros_like(value, dtype=torch.bool), gradient.abs().amax(-1) == 0
         self.done = self.converged | ~value.isfinite()
-        self.aim(torch.arange(len(x), device=x.device))
+        self.aim(~self.done)
 
     def aim(self, rows: Tensor) -> None:
         """A new step for these rows and the length of it to try first: all of it, or one px while the scale is not known."""
-        step = -(self.inverse[rows] @ self.gradient[rows][..., None])[..., 0]
-        limit = self.stop.longest / _norm(step, self.metric[rows]).clamp_min(torch.finfo(step.dtype).tiny)
-        self.step[rows], self.limit[rows] = step, limit
-        self.length[rows] = torch.where(self.scaled[rows], limit.clamp_max(1.0), limit / max(1.0, self.stop.longest))
-        self.low[rows], self.high[rows], self.trials[rows] = 0, torch.inf, 0
+        self.step = torch.where(rows[:, None], -(self.inverse @ self.gradient[..., None])[..., 0], self.step)
+        self.norm = _norm(self.step, self.metric)
+        self.limit = self.stop.longest / self.norm.clamp_min(torch.finfo(self.step.dtype).tiny)
+        first = torch.where(self.scaled, self.limit.clamp_max(1.0), self.limit / max(1.0, self.stop.longest))
+        self.length = torch.where(rows, first, self.length)
+        self.low, self.high = self.low.masked_fill(rows, 0), self.high.masked_fill(rows, torch.inf)
+        self.trials = self.trials.masked_fill(rows, 0)
+
+    def shrink(self, guess: Tensor, too_long: Tensor) -> None:
+        """Were the length wrong: narrow the bracket, and try the guess, kept off its ends, or twice as far while it is open."""
+        self.low = torch.where(too_long, self.low, self.length)
+        self.high = torch.where(too_long, self.length, self.high)
+        width, unbounded = self.high - self.low, self.high.isinf()
+        share = ((guess - self.low) / width).nan_to_num(0.0).clamp(0.1, 0.5)
+        closed = self.low + share * width.masked_fill(unbounded, 0)
+        self.length = torch.where(unbounded, torch.minimum(2 * self.length, self.limit), closed)
+        self.trials = self.trials + 1
 
     def accept(self, rows: Tensor, x: Tensor, value: Tensor, gradient: Tensor) -> None:
-        """The step was good: learn the curvature from it, and aim again."""
-        self.inverse[rows], usable = _update(self.inverse[rows], x - self.x[rows], gradient - self.gradient[rows], ~self.scaled[rows])
-        self.x[rows], self.value[rows], self.gradient[rows] = x, value, gradient
-        self.scaled[rows] = self.scaled[rows] | usable
-        self.iterations[rows] += 1
-        self.aim(rows)
+        """The step of these rows was good: learn the curvature from it."""
+        inverse, usable = _update(self.inverse, x - self.x, gradient - self.gradient, ~self.scaled)
+        usable = rows & usable
+        self.inverse = torch.where(usable[:, None, None], inverse, self.inverse)
+        self.x, self.gradient = (torch.where(rows[:, None], *both) for both in ((x, self.x), (gradient, self.gradient)))
+        self.value = torch.where(rows, value, self.value)
+        self.scaled = self.scaled | usable
+        self.iterations = self.iterations + rows
 
-    def shrink(self, rows: Tensor, guess: Tensor, too_long: Tensor) -> None:
-        """The length was wrong: narrow the bracket, and try the guess, kept off its ends, or twice as far while it is open."""
-        length = self.length[rows]
-        self.low[rows] = torch.where(too_long, self.low[rows], length)
-        self.high[rows] = torch.where(too_long, length, self.high[rows])
-        low, high = self.low[rows], self.high[rows]
-        share = ((guess - low) / (high - low)).nan_to_num(0.0).clamp(0.1, 0.5)
-        closed = low + share * torch.where(high.isinf(), 0.0, high - low)
-        self.length[rows] = torch.where(high.isinf(), torch.minimum(2 * length, self.limit[rows]), closed)
-        self.trials[rows] += 1
+    def forget(self, rows: Tensor) -> None:
+        """Perhaps the curvature of these rows was wrong: once more without it."""
+        self.inverse = torch.where(rows[:, None, None], self.plain, self.inverse)
+        self.scaled = self.scaled & ~rows
 
-    def judge(self, rows: Tensor) -> None:
-        """Which rows are done: the full step is shorter than the tolerance, or so is the bracket along their own gradient."""
-        tolerance, norm = self.stop.tolerance, _norm(self.step[rows], self.metric[rows])
-        fresh = self.trials[rows] == 0
-        small = fresh & self.scaled[rows] & (self.length[rows] * norm < tolerance)
-        stuck = ~fresh & (self.high[rows] * norm < tolerance)
-        again = rows[stuck & self.scaled[rows]]  # perhaps the curvature was wrong: once more without it
-        self.inverse[again], self.scaled[again] = self.plain[again], False
-        self.aim(again)
-        self.converged[rows] = small | (stuck & ~torch.isin(rows, again))
-        spent = (self.iterations[rows] >= self.stop.iterations) | (self.trials[rows] >= self.stop.trials)
-        self.done[rows] = self.converged[rows] | spent
+    def judge(self, good: Tensor, stuck: Tensor) -> None:
+        """Which rows are done: the full step is shorter than the tolerance, or nothing can be done where they are stuck."""
+        small = good & self.scaled & (self.length * self.norm < self.stop.tolerance)
+        self.converged = self.converged | small | (stuck & ~self.done)
+        spent = (self.iterations >= self.stop.iterations) | (self.trials >= self.stop.trials)
+        self.done = self.done | self.converged | spent
 
 
 def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop: Stop | None = None) -> Minimum:
@@ -114,25 +117,34 @@ def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop
     Line search by bracketing to the weak Wolfe conditions (Nocedal & Wright, Numerical Optimization, ch. 3 and 6).
     """
     stop = stop or Stop()
-    metric = torch.eye(x.shape[-1]).to(x).expand(len(x), -1, -1) if metric is None else metric
+    metric = _eye(x).expand(len(x), -1, -1) if metric is None else metric
     state = _Rows(x, *objective(x, torch.arange(len(x), device=x.device)), metric, stop)
-    trace = [state.value.clone()]
-    while not state.done.all():
-        rows = (~state.done).nonzero()[:, 0]
-        length, step, value = state.length[rows], state.step[rows], state.value[rows]
-        x_new = state.x[rows] + length[:, None] * step
-        value_new, gradient_new = objective(x_new, rows)
-        state.evaluations[rows] += 1
-        slope, slope_new = (state.gradient[rows] * step).sum(-1), (gradient_new * step).sum(-1)
+    trace, evaluations = [state.value], torch.ones_like(state.iterations)
+    while len(rows := (going := ~state.done).nonzero()[:, 0]):  # the one line of a round that waits for a GPU
+        value, length, step = state.value, state.length, state.step
+        x_new = state.x + length[:, None] * step
+        found = objective(x_new[rows], rows)
+        value_new, gradient_new = (old.index_copy(0, rows, new) for old, new in zip((value, state.gradient), found, strict=True))
+        slope, slope_new = (state.gradient * step).sum(-1), (gradient_new * step).sum(-1)
         slack = 4 * torch.finfo(x.dtype).eps * value.abs()
         too_long = ~(value_new <= value + stop.armijo * length * slope + slack)  # also where it is nan
-        good = ~too_long & ~((slope_new < stop.wolfe * slope) & (length < state.limit[rows]))  # else it is too short
+        good = going & ~too_long & ~((slope_new < stop.wolfe * slope) & (length < state.limit))  # else it is too short
         parabola = -slope * length * length / (2 * (value_new - value - slope * length))  # through both values and the slope
-        state.accept(rows[good], x_new[good], value_new[good], gradient_new[good])
-        state.shrink(rows[~good], parabola[~good], too_long[~good])
-        state.judge(rows)
-        trace.append(torch.full_like(state.value, torch.nan).index_copy(0, rows, state.value[rows]))
-    return Minimum(state.x, state.value, state.iterations, state.evaluations, state.converged, torch.stack(trace, 1))
+        state.shrink(parabola, too_long)
+        stuck = ~good & (state.high * state.norm < stop.tolerance)  # the bracket is shorter than the tolerance
+        again = stuck & state.scaled
+        state.accept(good, x_new, value_new, gradient_new)
+        state.forget(again)
+        state.aim(good | again)
+        state.judge(good, stuck & ~again)
+        evaluations = evaluations + going
+        trace.append(torch.where(going, state.value, torch.nan))
+    return Minimum(state.x, state.value, state.iterations, evaluations, state.converged, torch.stack(trace, 1))
+
+
+def _eye(like: Tensor) -> Tensor:
+    """The identity [P, P] for vectors [B, P], made where they are: a copy to a GPU would wait for it."""
+    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
 
 
 def _norm(step: Tensor, metric: Tensor) -> Tensor:
@@ -141,16 +153,13 @@ def _norm(step: Tensor, metric: Tensor) -> Tensor:
 
 
 def _update(inverse: Tensor, s: Tensor, y: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """BFGS update (6.17) of the inverse Hessian [B, P, P] by step s and change of gradient y [B, P], and where there was one.
+    """BFGS update (6.17) of the inverse Hessian [B, P, P] by step s and change of gradient y [B, P], and where there is one.
 
-    Nothing is learned where s.y <= 0; the first time the scale is set too, (6.20).
+    Nothing is learned where s.y <= 0, and what stands there is not to be used; the first time the scale is set too, (6.20).
     """
     sy = (s * y).sum(-1)
     yHy = (y[:, None] @ inverse @ y[:, :, None])[:, 0, 0]
-    usable = (sy > 0) & (yHy > 0)
-    scale = torch.where(first & usable, sy / torch.where(usable, yHy, 1.0), 1.0)
-    inverse = inverse * scale[:, None, None]
-    rho = torch.where(usable, 1 / torch.where(usable, sy, 1.0), 0.0)[:, None, None]
-    left = torch.eye(s.shape[-1]).to(s) - rho * s[:, :, None] * y[:, None]
-    updated = left @ inverse @ left.mT + rho * s[:, :, None] * s[:, None]
-    return torch.where(usable[:, None, None], updated, inverse), usable
+    inverse = inverse * torch.where(first, sy / yHy, 1.0)[:, None, None]
+    rho_s = (1 / sy)[:, None, None] * s[:, :, None]
+    left = _eye(s) - rho_s * y[:, None]
+    return left @ inverse @ left.mT + rho_s * s[:, None], (sy > 0) & (yHy > 0)

@@ -86,7 +86,11 @@ class Model(ABC):
 
     def wall(self, x: Tensor, owner: Tensor) -> Tensor:
         """The known plane of each row, or the fronto-parallel one: -> normal [A, 3]."""
-        return x.new_tensor([0.0, 0.0, -1.0]).expand(len(x), 3) if self.normal is None else self.normal.to(x)[owner]
+        if self.normal is not None:
+            return self.normal.to(x)[owner]
+        normal = x.new_zeros(len(x), 3)
+        normal[:, 2] = -1
+        return normal
 
 
 class Rotation(Model):

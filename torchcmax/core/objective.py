@@ -98,8 +98,10 @@ def deformation(there: Displacement, H_k: Tensor, ray: Tensor, reference: float)
     logs = []
     for end in (-reference, 1 - reference):
         distance = 1 + end * (there.normal * there.shift).sum(-1, keepdim=True)  # below zero the camera is behind the plane
-        H = (H_k * H_k.new_tensor([end**k for k in range(H_k.shape[1])])[:, None, None]).sum(1)
-        depth = (H[:, 2, :, None] * ray).sum(1)
+        row = H_k[:, -1, 2]
+        for k in range(H_k.shape[1] - 2, -1, -1):
+            row = row * end + H_k[:, k, 2]
+        depth = (row[..., None] * ray).sum(1)
         logs.append(2 * distance.clamp_min(NEAREST).log() - 3 * depth.clamp_min(NEAREST).log())
     return torch.cat(logs, 1)
 
@@ -144,7 +146,7 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
     length to what moves nothing (the tilt of a plane before which nothing moves yet).
     """
     parameters, events = x.shape[-1], some.x.shape[-1]
-    steps = torch.eye(parameters).to(x)
+    steps = torch.eye(parameters, dtype=x.dtype, device=x.device)
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
     each = owner.repeat_interleave(2 * parameters)
     flat = model.homography(nearby, each, REFERENCES[look.reference]).transpose(1, 2).flatten(2)
@@ -153,7 +155,7 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
     J = (flow[:, 0] - flow[:, 1]) / 2 * (some.weight[owner] != 0).to(x)[:, None].repeat(1, 1, 2)
     G = (J[:, :, None] * J[:, None]).sum(-1) / events
     mean = G.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(torch.finfo(x.dtype).eps)
-    return G + RIDGE * mean[:, None, None] * torch.eye(parameters).to(x)
+    return G + RIDGE * mean[:, None, None] * steps
 
 
 IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order of kernels/search.py

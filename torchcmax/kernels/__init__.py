@@ -6,6 +6,7 @@ import importlib.util
 import logging
 import os
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 log = logging.getLogger("torchcmax")
 NEAREST = 1e-3  # depth of a ray below which it counts as behind the camera
+TRITON = (3, 3)  # the first that takes the kernels as they are written
 SWITCH = "TORCHCMAX_KERNELS"  # environment: 0 leaves the kernels out, to compare with
 _threads = 0
 
@@ -54,8 +56,12 @@ def _cpu() -> ModuleType | None:
 
 @lru_cache(maxsize=1)
 def _cuda() -> ModuleType | None:
-    if importlib.util.find_spec("triton") is None:
-        log.warning("torchcmax: without triton the GPU works slower; get it with: pip install triton")
+    try:
+        found = tuple(int(part) for part in version("triton").split(".")[:2])
+    except PackageNotFoundError:
+        found = (0, 0)
+    if found < TRITON:
+        log.warning("torchcmax: without triton %d.%d the GPU is slower; torch 2.7 and later bring it: pip install -U torch", *TRITON)
         return None
     from torchcmax.kernels import cuda
 

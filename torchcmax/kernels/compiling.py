@@ -18,7 +18,7 @@ FAST = {"reassoc", "contract", "arcp", "nsz"}  # sums in any order, fused multip
 
 def compiled(function: Callable[..., Any]) -> Any:
     """The function as machine code that runs without the interpreter's lock."""
-    options = {"nogil": True, "fastmath": FAST, "error_model": "numpy"}
+    options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy"}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder where code could be kept: it is compiled in every process

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,7 +142,7 @@ def _parts(rows: int, count: int) -> list[slice]:
     """A window is cut where there are fewer windows than threads."""
     pieces = 1 if rows >= kernels.threads() else max(1, min(kernels.threads() // max(rows, 1), count // PART))
     edges = [count * i // pieces for i in range(pieces + 1)]
-    return [slice(*edge) for edge in zip(edges, edges[1:], strict=False)]
+    return [slice(*edge) for edge in pairwise(edges)]
 
 
 def _spread(work: Callable[..., None], tasks: Sequence[tuple[int, ...]]) -> None:

@@ -19,12 +19,12 @@ BLOCK = 512  # events in a block at most: their intermediate numbers stay in the
 SPAN = 1 / 32  # of a window that a block may last, in float32
 EIGHTH = np.tan(np.pi / 8)
 # atan(sqrt(q)) / sqrt(q) as a polynomial of q up to tan^2(pi / 8), exact to 5e-16
-ARCTAN = chebyshev.Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 10, domain=[1e-12, EIGHTH**2])
-ARCTAN = tuple(float(c) for c in ARCTAN.convert(kind=np.polynomial.Polynomial).coef)
+_SERIES = chebyshev.Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 10, domain=[1e-12, EIGHTH**2])
+ARCTAN = tuple(float(c) for c in _SERIES.convert(kind=np.polynomial.Polynomial).coef)
 
 
 @compiled
-def expand(H, s, near):  # type: ignore[no-untyped-def]
+def expand(H, s, near):
     """The polynomial about s, by Horner's scheme: H [K, 3, 3] -> A, B, C, near [3, 3, 3]."""
     near[:] = 0
     for k in range(len(H) - 1, -1, -1):
@@ -34,8 +34,9 @@ def expand(H, s, near):  # type: ignore[no-untyped-def]
                 near[1, i, j] = near[1, i, j] * s + near[0, i, j]
                 near[0, i, j] = near[0, i, j] * s + H[k, i, j]
 
+
 @compiled
-def block_end(s, first, last, span):  # type: ignore[no-untyped-def]
+def block_end(s, first, last, span):
     """Where the block that begins at `first` ends, and the middle of its times; events need not be in order."""
     end = min(first + BLOCK, last)
     while True:
@@ -52,7 +53,7 @@ def block_end(s, first, last, span):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def carry(near, s_0, x, y, s, ray):  # type: ignore[no-untyped-def]
+def carry(near, s_0, x, y, s, ray):
     """Rays of the reference camera: (A + u B + u^2 C) (x, y, 1) -> ray [3, n]."""
     for r in range(3):
         a, b, c = near[0, r, 0], near[0, r, 1], near[0, r, 2]
@@ -64,7 +65,7 @@ def carry(near, s_0, x, y, s, ray):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def land(ray, weight, lens, pixel, share):  # type: ignore[no-untyped-def]
+def land(ray, weight, lens, pixel, share):
     """Where rays meet the frame of a pinhole canvas: ray [3, n] -> pixel [n], share [3, n]: of the next column, row; weight."""
     focal, x, y, right, bottom, stride, near = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
     zero, one = lens.dtype.type(0), lens.dtype.type(1)
@@ -82,7 +83,7 @@ def land(ray, weight, lens, pixel, share):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def leave(slope, ray, n, lens):  # type: ignore[no-untyped-def]
+def leave(slope, ray, n, lens):
     """The derivative of `land`: slope [3, n] along columns, rows of the frame -> along the rays' three coordinates, in place."""
     focal, near, one = lens[0], lens[6], lens.dtype.type(1)
     for i in range(n):
@@ -94,7 +95,7 @@ def leave(slope, ray, n, lens):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def angle(y, x, like):  # type: ignore[no-untyped-def]
+def angle(y, x, like):
     """atan2 without a branch, so that eight are computed at once; in the precision of the array `like`."""
     number = like.dtype.type
     one, up, right = number(1), abs(y), abs(x)
@@ -113,7 +114,7 @@ def angle(y, x, like):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def land_round(ray, weight, lens, pixel, share):  # type: ignore[no-untyped-def]
+def land_round(ray, weight, lens, pixel, share):
     """`land` for the frame of a sphere: azimuth and elevation."""
     focal, x, y, right, bottom, stride, least = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6]
     zero = lens.dtype.type(0)
@@ -130,7 +131,7 @@ def land_round(ray, weight, lens, pixel, share):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def leave_round(slope, ray, n, lens):  # type: ignore[no-untyped-def]
+def leave_round(slope, ray, n, lens):
     """The derivative of `land_round`, as `leave`."""
     focal, least, one = lens[0], lens[6], lens.dtype.type(1)
     for i in range(n):
@@ -146,7 +147,7 @@ def leave_round(slope, ray, n, lens):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def scatter(pixel, share, stride, frame):  # type: ignore[no-untyped-def]
+def scatter(pixel, share, stride, frame):
     """Add each weight to the four pixels around its point: frame [(H + 2) (W + 2)]."""
     one, step = np.uint64(1), np.uint64(stride)
     for i in range(len(pixel)):
@@ -161,7 +162,7 @@ def scatter(pixel, share, stride, frame):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def look(pixel, share, stride, frame):  # type: ignore[no-untyped-def]
+def look(pixel, share, stride, frame):
     """The derivative of `scatter`: weight times slope of dL/dframe along columns and rows, in place of the shares."""
     one, step = np.uint64(1), np.uint64(stride)
     for i in range(len(pixel)):
@@ -174,7 +175,7 @@ def look(pixel, share, stride, frame):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def gather(slope, x, y, s, s_0, near):  # type: ignore[no-untyped-def]
+def gather(slope, x, y, s, s_0, near):
     """The derivative of `carry`: sums over the events of slope [3, n] times (x, y, 1), times 1, u and u^2."""
     for r in range(3):
         a = b = c = d = e = f = g = h = k = x.dtype.type(0)
@@ -191,7 +192,7 @@ def gather(slope, x, y, s, s_0, near):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def collect(near, s, total):  # type: ignore[no-untyped-def]
+def collect(near, s, total):
     """The derivative of `expand`, added to the total [K, 3, 3]."""
     zeroth, first, second = 1.0, 0.0, 0.0  # s^k, k s^(k - 1), k (k - 1) / 2 s^(k - 2)
     for k in range(len(total)):
@@ -202,7 +203,7 @@ def collect(near, s, total):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def count(weight):  # type: ignore[no-untyped-def]
+def count(weight):
     """Events before the padding."""
     n = len(weight)
     while n > 0 and weight[n - 1] == 0:
@@ -211,7 +212,7 @@ def count(weight):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def draw(H, events, lens, frame):  # type: ignore[no-untyped-def]
+def draw(H, events, lens, frame):
     """Warp the events of a window and vote: H [K, 3, 3] | events: x, y, s, weight [N] | frame [(H + 2) (W + 2)], added to."""
     x, y, s, weight = events
     last, stride = count(weight), np.int64(lens[5])
@@ -232,7 +233,7 @@ def draw(H, events, lens, frame):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def draw_slopes(H, events, lens, frame, total):  # type: ignore[no-untyped-def]
+def draw_slopes(H, events, lens, frame, total):
     """The derivative of `draw`: frame = dL/dframe | total [K, 3, 3] float64, added to."""
     x, y, s, weight = events
     last, stride = count(weight), np.int64(lens[5])
@@ -256,4 +257,3 @@ def draw_slopes(H, events, lens, frame, total):  # type: ignore[no-untyped-def]
         gather(share, x[i:end], y[i:end], s[i:end], s_0, near)
         collect(near, s_0, total)
         i = end
-

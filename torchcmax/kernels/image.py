@@ -13,7 +13,7 @@ CONTRASTS = ("variance", "mean_square", "high_pass", "michelson", "gradient_magn
 
 
 @compiled
-def taps(sigma):  # type: ignore[no-untyped-def]
+def taps(sigma):
     """Half of the Gaussian kernel, cut at 3 sigma: -> [radius + 1]; the middle alone for sigma 0."""
     radius = max(1, round(3 * sigma)) if sigma > 0 else 0
     kernel = np.ones(radius + 1)
@@ -23,7 +23,7 @@ def taps(sigma):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def border(frame):  # type: ignore[no-untyped-def]
+def border(frame):
     """Drop what lies outside of the canvas."""
     frame[0] = 0
     frame[-1] = 0
@@ -32,60 +32,74 @@ def border(frame):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def scaled(kernel, row, result):  # type: ignore[no-untyped-def]
+def scaled(kernel, row, result):
     """result = kernel row."""
     for i in range(len(result)):
         result[i] = kernel * row[i]
 
 
 @compiled
-def add_pair(kernel, one, other, result):  # type: ignore[no-untyped-def]
+def add_pair(kernel, pair, result):
     """result += kernel (one + other)."""
+    one, other = pair
     for i in range(len(result)):
         result[i] += kernel * (one[i] + other[i])
 
 
 @compiled
-def add_pairs(kernel, a, b, c, d, e, f, result):  # type: ignore[no-untyped-def]
-    """Three pairs at once: each number of the result is loaded and stored once for all."""
-    k, l, m = kernel[0], kernel[1], kernel[2]
+def add_pairs(kernel, pairs, result):
+    """result += three such sums at once, so that each number of the result is loaded and stored once for all."""
+    (a, b), (c, d), (e, f) = pairs
+    first, second, third = kernel[0], kernel[1], kernel[2]
     for i in range(len(result)):
-        result[i] += k * (a[i] + b[i]) + l * (c[i] + d[i]) + m * (e[i] + f[i])
+        result[i] += first * (a[i] + b[i]) + second * (c[i] + d[i]) + third * (e[i] + f[i])
 
 
 @compiled
-def blur(frame, kernel, line, result):  # type: ignore[no-untyped-def]
-    """Smooth in both directions, row by row; nothing lies outside: line [W + 2 + 2 radius], scratch, its ends are zero.
+def rows(frame, y, i):
+    """The rows i above and below y; the empty border beyond the frame."""
+    return frame[max(y - i, 0)], frame[min(y + i, len(frame) - 1)]
+
+
+@compiled
+def shifts(line, start, length, i):
+    """The line i further left and right."""
+    return line[start - i : start - i + length], line[start + i : start + i + length]
+
+
+@compiled
+def blur(frame, kernel, line, result):
+    """Smooth in both directions, row by row; nothing lies outside: line [W + 2 + 2 radius], scratch.
 
     The border of the result is not written.
     """
     height, width, radius = frame.shape[0], frame.shape[1], len(kernel) - 1
-    inner = width - 2
+    start, inner = radius + 1, width - 2
     line[:] = 0
     middle = line[radius : radius + width]
     for y in range(1, height - 1):
         scaled(kernel[0], frame[y], middle)
         i = 1
         while i + 2 <= radius:
-            add_pairs(kernel[i:], frame[max(y - i, 0)], frame[min(y + i, height - 1)], frame[max(y - i - 1, 0)], frame[min(y + i + 1, height - 1)], frame[max(y - i - 2, 0)], frame[min(y + i + 2, height - 1)], middle)
+            add_pairs(kernel[i:], (rows(frame, y, i), rows(frame, y, i + 1), rows(frame, y, i + 2)), middle)
             i += 3
         while i <= radius:
-            add_pair(kernel[i], frame[max(y - i, 0)], frame[min(y + i, height - 1)], middle)
+            add_pair(kernel[i], rows(frame, y, i), middle)
             i += 1
-        out, o = result[y, 1 : width - 1], radius + 1
-        scaled(kernel[0], line[o : o + inner], out)
+        out = result[y, 1 : width - 1]
+        scaled(kernel[0], line[start : start + inner], out)
         i = 1
         while i + 2 <= radius:
-            add_pairs(kernel[i:], line[o - i : o - i + inner], line[o + i : o + i + inner], line[o - i - 1 : o - i - 1 + inner],
-                      line[o + i + 1 : o + i + 1 + inner], line[o - i - 2 : o - i - 2 + inner], line[o + i + 2 : o + i + 2 + inner], out)
+            pairs = shifts(line, start, inner, i), shifts(line, start, inner, i + 1), shifts(line, start, inner, i + 2)
+            add_pairs(kernel[i:], pairs, out)
             i += 3
         while i <= radius:
-            add_pair(kernel[i], line[o - i : o - i + inner], line[o + i : o + i + inner], out)
+            add_pair(kernel[i], shifts(line, start, inner, i), out)
             i += 1
 
 
 @compiled
-def contrast(code, frame, slope, spare):  # type: ignore[no-untyped-def]
+def contrast(code, frame, slope, spare):
     """The contrast at this place of CONTRASTS, and its derivative to the frame; slope and spare [H + 2, W + 2] are written.
 
     All three have an empty border.
@@ -104,13 +118,13 @@ def contrast(code, frame, slope, spare):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def pixels(frame):  # type: ignore[no-untyped-def]
+def pixels(frame):
     """Of the canvas."""
     return (frame.shape[0] - 2) * (frame.shape[1] - 2)
 
 
 @compiled
-def variance(frame, slope):  # type: ignore[no-untyped-def]
+def variance(frame, slope):
     total = 0.0
     for y in range(1, frame.shape[0] - 1):
         row, part = frame[y], frame.dtype.type(0)
@@ -121,7 +135,7 @@ def variance(frame, slope):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def centred_square(frame, centre, slope):  # type: ignore[no-untyped-def]
+def centred_square(frame, centre, slope):
     """Mean squared distance from the centre."""
     total, centre, scale = 0.0, frame.dtype.type(centre), frame.dtype.type(2 / pixels(frame))
     for y in range(1, frame.shape[0] - 1):
@@ -135,7 +149,7 @@ def centred_square(frame, centre, slope):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def laplacian(frame, factor, result):  # type: ignore[no-untyped-def]
+def laplacian(frame, factor, result):
     """The five-point Laplacian times the factor -> result, and the sum of its squares."""
     total, factor, four = 0.0, frame.dtype.type(factor), frame.dtype.type(4)
     for y in range(1, frame.shape[0] - 1):
@@ -148,14 +162,14 @@ def laplacian(frame, factor, result):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def high_pass(frame, slope, spare):  # type: ignore[no-untyped-def]
+def high_pass(frame, slope, spare):
     energy = laplacian(frame, 1.0, spare)
     laplacian(spare, 1 / (10 * pixels(frame)), slope)
     return energy / (20 * pixels(frame))
 
 
 @compiled
-def michelson(frame, slope):  # type: ignore[no-untyped-def]
+def michelson(frame, slope):
     one = three = four = 0.0
     for y in range(1, frame.shape[0] - 1):
         for x in range(1, frame.shape[1] - 1):
@@ -175,7 +189,7 @@ def michelson(frame, slope):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def gradient_magnitude(frame, slope):  # type: ignore[no-untyped-def]
+def gradient_magnitude(frame, slope):
     """Differences to the right and lower neighbours; each belongs to both of its pixels."""
     total, scale = 0.0, frame.dtype.type(1 / (2 * pixels(frame)))
     slope[:] = 0

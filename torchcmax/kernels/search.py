@@ -11,7 +11,7 @@ from torchcmax.kernels.events import draw, draw_slopes
 from torchcmax.kernels.image import CONTRASTS, blur, border, contrast
 
 ROTATION, TRANSLATION, PLANAR_KNOWN, PLANAR = range(4)
-STEP = 1e-2  # px: of the central differences of the homography, which is smooth and in float64
+STEP = 1e-3  # px: of the central differences of the homography, which is smooth and in float64
 MICHELSON = CONTRASTS.index("michelson")
 
 
@@ -55,7 +55,7 @@ class Scene(NamedTuple):
 
 
 @compiled
-def product(a, b, result):  # type: ignore[no-untyped-def]
+def product(a, b, result):
     """result = a b for 3 x 3 matrices."""
     for i in range(3):
         for j in range(3):
@@ -63,7 +63,7 @@ def product(a, b, result):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rotated(w, v):  # type: ignore[no-untyped-def]
+def rotated(w, v):
     """exp(w) v, eq. (2.8)."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     sine = 1 - angle * angle / 6 if angle < 1e-3 else np.sin(angle) / angle
@@ -75,7 +75,7 @@ def rotated(w, v):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def motion(x, look, known, there):  # type: ignore[no-untyped-def]
+def motion(x, look, known, there):
     """x [P] px -> turn, shift, normal in the frame of the reference camera, there [3, 3]: core.model."""
     there[:] = 0
     there[2] = known
@@ -97,7 +97,7 @@ def motion(x, look, known, there):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def homography(there, H):  # type: ignore[no-untyped-def]
+def homography(there, H):
     """turn, shift, normal -> H [K, 3, 3]: core.warp.polynomial."""
     turn, shift, normal = there[0], there[1], there[2]
     k = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
@@ -115,7 +115,7 @@ def homography(there, H):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def guard(there, H, look, some):  # type: ignore[no-untyped-def]
+def guard(there, H, look, some):
     """core.objective.penalty, with the deformation that it watches."""
     if look.model == ROTATION:
         return 0.0
@@ -142,7 +142,7 @@ def guard(there, H, look, some):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def metric(x, look, scene, terms):  # type: ignore[no-untyped-def]
+def metric(x, look, scene, terms):
     """core.objective.metric: [P, P]."""
     px, py, s, weight = scene.some
     parameters, count = len(x), len(px)
@@ -173,7 +173,7 @@ def metric(x, look, scene, terms):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def inverted(G):  # type: ignore[no-untyped-def]
+def inverted(G):
     """Inverse of a positive definite matrix by Gauss and Jordan, so that scipy is not needed."""
     left, right = G.copy(), np.eye(len(G))
     for p in range(len(G)):
@@ -189,7 +189,7 @@ def inverted(G):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def energy_of(weight, code, frames):  # type: ignore[no-untyped-def]
+def energy_of(weight, code, frames):
     """Contrast of events that each lie on a pixel of their own, as core.contrast.normalized; Michelson's knows no scale."""
     total = weight.dtype.type(0)
     for i in range(len(weight)):
@@ -200,7 +200,7 @@ def energy_of(weight, code, frames):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def value_at(x, look, scene, energy, H):  # type: ignore[no-untyped-def]
+def value_at(x, look, scene, energy, H):
     """-log contrast + guard at x, and the contrast; H [K, 3, 3] and scene.frames are left for `slope_at`."""
     image, blurred, slope = scene.frames[0], scene.frames[1], scene.frames[2]
     there, exact = np.empty((3, 3)), np.empty(H.shape)
@@ -217,7 +217,7 @@ def value_at(x, look, scene, energy, H):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def sharpness(H, events, lens, kernel, code, frames, line):  # type: ignore[no-untyped-def]
+def sharpness(H, events, lens, kernel, code, frames, line):
     """The normalized contrast of one image."""
     image, blurred = frames[0], frames[1]
     image[:] = 0
@@ -229,7 +229,7 @@ def sharpness(H, events, lens, kernel, code, frames, line):  # type: ignore[no-u
 
 
 @compiled
-def slope_at(x, sharpness, look, scene, H):  # type: ignore[no-untyped-def]
+def slope_at(x, sharpness, look, scene, H):
     """The derivative of `value_at`, right after it: -> [P]."""
     image, slope = scene.frames[0], scene.frames[2]
     to_H = np.zeros(H.shape)
@@ -249,13 +249,13 @@ def slope_at(x, sharpness, look, scene, H):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def length_in(step, G):  # type: ignore[no-untyped-def]
+def length_in(step, G):
     """px: length of a step [P] in the metric."""
     return np.sqrt(max((step * (G * step).sum(1)).sum(), 0.0))
 
 
 @compiled
-def learn(inverse, s, y, first):  # type: ignore[no-untyped-def]
+def learn(inverse, s, y, first):
     """BFGS update of the inverse Hessian in place, as core.minimize; whether there was something to learn."""
     sy, Hy = (s * y).sum(), (inverse * y).sum(1)
     yHy = (y * Hy).sum()
@@ -272,7 +272,7 @@ def learn(inverse, s, y, first):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def aimed(inverse, gradient, G, scaled, stop):  # type: ignore[no-untyped-def]
+def aimed(inverse, gradient, G, scaled, stop):
     """A new step, the longest share of it, and the share to try first: core.minimize."""
     step = -(inverse * gradient).sum(1)
     limit = stop.longest / max(length_in(step, G), 1e-300)
@@ -280,7 +280,7 @@ def aimed(inverse, gradient, G, scaled, stop):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def narrowed(length, low, high, limit, guess):  # type: ignore[no-untyped-def]
+def narrowed(length, low, high, limit, guess):
     """The next length to try: the guess, kept off the ends of the bracket, or twice as far while it is open."""
     if np.isinf(high):
         return min(2 * length, limit)
@@ -289,7 +289,7 @@ def narrowed(length, low, high, limit, guess):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def search(x, look, scene, stop, terms):  # type: ignore[no-untyped-def]
+def search(x, look, scene, stop, terms):
     """Minimize from x [P]: -> x, value, iterations, evaluations, converged, trace [T] as core.minimize."""
     G = metric(x, look, scene, terms)
     plain, H = inverted(G), np.empty((terms, 3, 3), scene.lens.dtype)
