@@ -13,7 +13,7 @@ from torchcmax.core.contrast import CONTRASTS, _smooth, normalized
 from torchcmax.core.draw import Ink, _framed, draw_twin
 from torchcmax.core.minimize import Stop, minimize
 from torchcmax.core.model import Planar, PlanarKnown, Rotation, Translation
-from torchcmax.core.objective import Look, View, metric, minimum, objective, penalty
+from torchcmax.core.objective import Look, View, metric, minimum, objective, penalty, problem
 from torchcmax.core.vote import vote_scatter
 from torchcmax.core.warp import polynomial
 from torchcmax.core.window import Window
@@ -216,7 +216,7 @@ def test_motion_homography_guard_and_metric_are_the_twins(kind, reference, scene
     model = kind(60.0, wall)
     view, owner = look.at(window, canvas, 1.0), torch.arange(2)
     share = {"middle": 0.5, "first": 0.0}[reference]
-    numbers = kernel_look(look, model)
+    numbers = problem(look, model, view).look
     for size in (0.0, 5.0, 60.0):  # the guard speaks at the last
         x = size * (random(2, kind.size) - 0.5)
         there_twin = model.at_reference(x, owner, share)
@@ -232,26 +232,6 @@ def test_motion_homography_guard_and_metric_are_the_twins(kind, reference, scene
             assert search.guard(there, H, numbers, some) == pytest.approx(cost_twin[row].item(), rel=1e-9, abs=1e-12)
             G = search.metric(x[row].numpy(), numbers, search.Scene((), some, wall[row].numpy(), *([None] * 4)), 6)
             np.testing.assert_allclose(G, G_twin[row], rtol=1e-8, atol=1e-10)
-
-
-def kernel_look(look, model):
-    """The look in numbers, as core/objective.py hands it over."""
-    caught = {}
-
-    class Spy:
-        Look = search.Look
-
-        @staticmethod
-        def Problem(*fields):
-            caught["look"] = fields[2]
-
-    original, kernels.searching = kernels.searching, lambda like: Spy
-    try:
-        window = Window(torch.ones(2, 4, 3), torch.zeros(2, 4), torch.ones(2, 4), torch.zeros(2), torch.ones(2))
-        minimum(look, model, look.at(window, CANVAS, 1.0), torch.arange(2))
-    finally:
-        kernels.searching = original
-    return caught["look"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -271,6 +251,24 @@ def test_the_search_is_the_twin_step_by_step(kind, contrast, scene, plain):
     assert torch.equal(found.converged, twin.converged)
     torch.testing.assert_close(found.trace, twin.trace, rtol=1e-7, atol=1e-9, equal_nan=True)
     torch.testing.assert_close(found.x, twin.x, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_value_and_gradient_are_the_twins(kind, threads, scene, random, plain, monkeypatch):
+    monkeypatch.setattr(cpu, "PART", 1000)  # so that two threads share a window
+    window, canvas = scene
+    look, model, owner = Look(), kind(60.0), torch.tensor([1])
+    view, x = look.at(window, canvas, 1.0), 4 * (random(1, kind.size) - 0.5)
+    kernels.set_threads(threads)
+    try:
+        value, gradient = objective(look, model, view, owner)(x, torch.tensor([0]))
+    finally:
+        kernels.set_threads(0)
+    plain()
+    value_twin, gradient_twin = objective(look, model, view, owner)(x, torch.tensor([0]))
+    torch.testing.assert_close(value, value_twin, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(gradient, gradient_twin, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("polarity", ["dropped", "signed"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -124,6 +124,9 @@ def penalty(look: Look, model: Model, there: Displacement, H_k: Tensor, ray: Ten
 
 def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
     """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to."""
+    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x)
+    if numbers is not None and kernel is not None:
+        return lambda x, rows: kernel.evaluate(numbers, x, owner[rows])
     ray = view.some.ray
 
     def evaluate(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -161,19 +164,23 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
 IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order of kernels/search.py
 
 
-def minimum(look: Look, model: Model, view: View, owner: Tensor) -> Callable[[Tensor, Stop | None], Minimum]:
-    """The way to the minimum of `objective` from x [B, P], measured by `metric`: in machine code where there is some for it.
-
-    Models of others, and other devices, go through `minimize`.
-    """
+def problem(look: Look, model: Model, view: View) -> Any:
+    """What the kernels of this device want for the same objective; None where there is no kernel, or the model is someone's own."""
     kernel = kernels.searching(view.ink.x)
     if kernel is None or type(model) not in IN_MACHINE_CODE:
-        return lambda x, stop: minimize(objective(look, model, view, owner), x, metric(look, model, view.some, x, owner), stop)
+        return None
     sought = kernel.Look(
         model=IN_MACHINE_CODE.index(type(model)), focal=model.focal, reference=REFERENCES[look.reference],
         contrast=list(CONTRASTS).index(look.contrast), deformation=look.deformation, guard=look.guard, tilt=look.tilt,
         closest=CLOSEST, grazing=GRAZING, nearest=NEAREST, ridge=RIDGE,
     )  # fmt: skip
     known = model.wall(view.ink.x, torch.arange(len(view.ink.x)))
-    problem = kernel.Problem(view, known, sought, TERMS)
-    return lambda x, stop: Minimum(*kernel.search(problem, x, owner, stop or Stop()))
+    return kernel.Problem(view, known, sought, TERMS)
+
+
+def minimum(look: Look, model: Model, view: View, owner: Tensor) -> Callable[[Tensor, Stop | None], Minimum]:
+    """The way to the minimum of `objective` from x [B, P], measured by `metric`: in machine code where there is some for it."""
+    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x)
+    if numbers is None or kernel is None:
+        return lambda x, stop: minimize(objective(look, model, view, owner), x, metric(look, model, view.some, x, owner), stop)
+    return lambda x, stop: Minimum(*kernel.search(numbers, x, owner, stop or Stop()))

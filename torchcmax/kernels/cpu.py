@@ -82,17 +82,59 @@ def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
     return torch.from_numpy(values).to(H_k)
 
 
+def evaluate(problem: Problem, x: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
+    """Value and gradient of `core.objective`: x [A, P] | owner [A] -> [A], [A, P].  Threads share a window where there are few."""
+    places, scene_of = _array(x.double()), _scenes(problem)
+    parts = _parts(len(x), problem.view.ink.x.shape[-1])
+    values, gradients = np.zeros(len(x)), np.zeros(places.shape)
+
+    def work(row: int, window: int) -> None:
+        values[row], gradients[row] = searching.evaluate(places[row], problem.look, scene_of(window), problem.terms)
+
+    tasks = list(enumerate(owner.tolist()))
+    if len(parts) == 1:
+        _spread(work, tasks)
+    else:
+        for row, window in tasks:
+            values[row], gradients[row] = _shared(problem, places[row], scene_of(window), parts)
+    return torch.from_numpy(values).to(x), torch.from_numpy(gradients).to(x)
+
+
+def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slice]) -> tuple[float, Array]:
+    """`searching.evaluate` of one window by several threads, each with a frame of its own for its part of the events."""
+    look, frames = problem.look, np.zeros((len(parts), scene.frames[0].size), scene.lens.dtype)
+    exact, there = searching.homography_at(x, look, scene.normal, problem.terms)
+    H, totals = exact.astype(scene.lens.dtype), np.zeros((len(parts), *exact.shape))
+    pieces = [tuple(array[part] for array in scene.events) for part in parts]
+    _spread(lambda i: events.draw(H, pieces[i], scene.lens, frames[i]), [(i,) for i in range(len(parts))])
+    frames.sum(0, out=scene.frames[0].reshape(-1))
+    sharp = searching.develop(look.contrast, scene.kernel, scene.frames, scene.line)
+    searching.develop_slope(scene.kernel, scene.frames, scene.line)
+    flat = scene.frames[0].reshape(-1)
+    _spread(lambda i: events.draw_slopes(H, pieces[i], scene.lens, flat, totals[i]), [(i,) for i in range(len(parts))])
+    cost = searching.guard(there, exact, look, scene.some)
+    energy = searching.energy_of(scene.events[3], look.contrast, scene.frames)
+    with np.errstate(divide="ignore", invalid="ignore"):  # an empty image has no contrast
+        value, to_H = cost - np.log(sharp / energy), totals.sum(0) / -sharp
+    return value, searching.chained(x, to_H, look, scene.normal, scene.some)
+
+
+def _scenes(problem: Problem) -> Callable[[int], searching.Scene]:
+    """A window of the problem, with scratch that belongs to the thread that asks."""
+    view = problem.view
+    rows, some, normal = _rows(view.ink), _rows(view.some), _array(problem.normal.double())
+    lens, taps = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x)
+    return lambda window: searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(view.canvas, taps))
+
+
 def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor]:
     """`core.minimize` of `core.objective`, each row in machine code: x [B, P] | owner [B] -> the fields of a Minimum."""
-    ink, canvas = problem.view.ink, problem.view.canvas
-    start, rows, some = _array(x.double()), _rows(ink), _rows(problem.view.some)
-    lens, taps, normal = lens_of(canvas, ink.x), _taps(problem.view.sigma, ink.x), _array(problem.normal.double())
+    start, scene_of = _array(x.double()), _scenes(problem)
     limits = searching.Stop(*(getattr(stop, name) for name in searching.Stop._fields))
     found: list[Any] = [None] * len(x)
 
     def work(row: int, window: int) -> None:
-        scene = searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(canvas, taps))
-        found[row] = searching.search(start[row], problem.look, scene, limits, problem.terms)
+        found[row] = searching.search(start[row], problem.look, scene_of(window), limits, problem.terms)
 
     _spread(work, list(enumerate(owner.tolist())))
     *numbers, traces = zip(*found, strict=True)

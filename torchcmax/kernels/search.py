@@ -146,14 +146,13 @@ def metric(x, look, scene, terms):
     """core.objective.metric: [P, P]."""
     px, py, s, weight = scene.some
     parameters, count = len(x), len(px)
-    there, H, J = np.empty((3, 3)), np.empty((terms, 3, 3)), np.empty((parameters, 2, count))
+    J = np.empty((parameters, 2, count))
     for p in range(parameters):
         J[p] = 0
         for side in (1.0, -1.0):
             near = x.copy()
             near[p] += side
-            motion(near, look, scene.normal, there)
-            homography(there, H)
+            H, _ = homography_at(near, look, scene.normal, terms)
             for i in range(count):
                 ray = np.zeros(3)
                 for k in range(terms - 1, -1, -1):
@@ -200,52 +199,78 @@ def energy_of(weight, code, frames):
 
 
 @compiled
-def value_at(x, look, scene, energy, H):
-    """-log contrast + guard at x, and the contrast; H [K, 3, 3] and scene.frames are left for `slope_at`."""
-    image, blurred, slope = scene.frames[0], scene.frames[1], scene.frames[2]
-    there, exact = np.empty((3, 3)), np.empty(H.shape)
-    motion(x, look, scene.normal, there)
-    homography(there, exact)
-    H[:] = exact
-    image[:] = 0
-    draw(H, scene.events, scene.lens, image.reshape(-1))
-    border(image)
-    blur(image, scene.kernel, scene.line, blurred)
-    border(blurred)
-    sharpness = contrast(look.contrast, blurred, slope, image)
-    return guard(there, exact, look, scene.some) - np.log(sharpness / energy), sharpness
+def homography_at(x, look, known, terms):
+    """The warp of x [P] to the reference camera: -> H [K, 3, 3], and turn, shift and normal there, [3, 3]."""
+    there, H = np.empty((3, 3)), np.empty((terms, 3, 3))
+    motion(x, look, known, there)
+    homography(there, H)
+    return H, there
+
+
+@compiled
+def develop(code, kernel, frames, line):
+    """The contrast of the votes in frames[0]; its derivative to the blurred image is left in frames[2]."""
+    border(frames[0])
+    blur(frames[0], kernel, line, frames[1])
+    border(frames[1])
+    return contrast(code, frames[1], frames[2], frames[0])
+
+
+@compiled
+def develop_slope(kernel, frames, line):
+    """The derivative of `develop` to the votes, right after it: left in frames[0]."""
+    blur(frames[2], kernel, line, frames[0])
+    border(frames[0])
 
 
 @compiled
 def sharpness(H, events, lens, kernel, code, frames, line):
     """The normalized contrast of one image."""
-    image, blurred = frames[0], frames[1]
-    image[:] = 0
-    draw(H, events, lens, image.reshape(-1))
-    border(image)
-    blur(image, kernel, line, blurred)
-    border(blurred)
-    return contrast(code, blurred, frames[2], image) / energy_of(events[3], code, frames)
+    frames[0] = 0
+    draw(H, events, lens, frames[0].reshape(-1))
+    return develop(code, kernel, frames, line) / energy_of(events[3], code, frames)
 
 
 @compiled
-def slope_at(x, sharpness, look, scene, H):
+def value_at(x, look, scene, energy, H):
+    """-log contrast + guard at x, and the contrast; H [K, 3, 3] and scene.frames are left for `slope_at`."""
+    exact, there = homography_at(x, look, scene.normal, len(H))
+    H[:] = exact
+    scene.frames[0] = 0
+    draw(H, scene.events, scene.lens, scene.frames[0].reshape(-1))
+    sharp = develop(look.contrast, scene.kernel, scene.frames, scene.line)
+    return guard(there, exact, look, scene.some) - np.log(sharp / energy), sharp
+
+
+@compiled
+def slope_at(x, sharp, look, scene, H):
     """The derivative of `value_at`, right after it: -> [P]."""
-    image, slope = scene.frames[0], scene.frames[2]
     to_H = np.zeros(H.shape)
-    blur(slope, scene.kernel, scene.line, image)
-    border(image)
-    draw_slopes(H, scene.events, scene.lens, image.reshape(-1), to_H)
-    result, there, H_there = np.zeros(len(x)), np.empty((3, 3)), np.empty(H.shape)
+    develop_slope(scene.kernel, scene.frames, scene.line)
+    draw_slopes(H, scene.events, scene.lens, scene.frames[0].reshape(-1), to_H)
+    to_H /= -sharp
+    return chained(x, to_H, look, scene.normal, scene.some)
+
+
+@compiled
+def chained(x, to_H, look, known, some):
+    """The derivative of <to_H, H> + guard to x, by central differences of both, which are smooth: -> [P]."""
+    result = np.zeros(len(x))
     for p in range(len(x)):
         for side in (1.0, -1.0):
             near = x.copy()
             near[p] += side * STEP
-            motion(near, look, scene.normal, there)
-            homography(there, H_there)
-            cost = guard(there, H_there, look, scene.some) - (to_H * H_there).sum() / sharpness
-            result[p] += side * cost / (2 * STEP)
+            H, there = homography_at(near, look, known, len(to_H))
+            result[p] += side * ((to_H * H).sum() + guard(there, H, look, some)) / (2 * STEP)
     return result
+
+
+@compiled
+def evaluate(x, look, scene, terms):
+    """Value and derivative at x."""
+    H = np.empty((terms, 3, 3), scene.lens.dtype)
+    value, sharp = value_at(x, look, scene, energy_of(scene.events[3], look.contrast, scene.frames), H)
+    return value, slope_at(x, sharp, look, scene, H)
 
 
 @compiled
@@ -296,8 +321,8 @@ def search(x, look, scene, stop, terms):
     inverse, eps = plain.copy(), np.finfo(scene.lens.dtype).eps
     energy = energy_of(scene.events[3], look.contrast, scene.frames)
     trace = np.empty(1 + stop.iterations * (stop.trials + 1))
-    value, sharpness = value_at(x, look, scene, energy, H)
-    gradient = slope_at(x, sharpness, look, scene, H)
+    value, sharp = value_at(x, look, scene, energy, H)
+    gradient = slope_at(x, sharp, look, scene, H)
     trace[0] = value
     iterations, trials, evaluations, scaled = 0, 0, 1, False
     converged = np.abs(gradient).max() == 0
@@ -306,13 +331,13 @@ def search(x, look, scene, stop, terms):
     low, high = 0.0, np.inf
     while not done:
         near = x + length * step
-        value_new, sharpness = value_at(near, look, scene, energy, H)
+        value_new, sharp = value_at(near, look, scene, energy, H)
         slope = (gradient * step).sum()
         good = value_new <= value + stop.armijo * length * slope + 4 * eps * abs(value)
         gradient_new, guess = gradient, -slope * length * length / (2 * (value_new - value - slope * length))
         too_long = not good
         if good:
-            gradient_new = slope_at(near, sharpness, look, scene, H)
+            gradient_new = slope_at(near, sharp, look, scene, H)
             good = not ((gradient_new * step).sum() < stop.wolfe * slope and length < limit)
         trace[evaluations] = value
         evaluations += 1
