@@ -1,39 +1,47 @@
 """Benchmark tables: scripts/run python scripts/bench.py [--recording REC] [--device cpu] [--json FILE]
 
-(a) one evaluation, ns per event; (b) a cold window per motion model; (c) a whole recording. Ratios within one run are to be
-trusted, absolute times depend on the machine and on who else works on it.
+(a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) memory;
+(e) what the device can do at best, measured in the same run.  Ratios within one run are to be trusted; absolute times depend on the
+machine and on who else works on it.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
+import os
 import platform
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 
-from torchcmax import __version__
+from torchcmax import __version__, kernels
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.core.camera import Canvas
-from torchcmax.core.contrast import CONTRASTS, blur, normalized
-from torchcmax.core.draw import Ink, draw, draw_twin
-from torchcmax.core.estimate import estimate
-from torchcmax.core.model import MODELS, Model, Planar
+from torchcmax.core.draw import Ink, draw_twin
+from torchcmax.core.estimate import Estimate, estimate
+from torchcmax.core.model import MODELS, Planar
+from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.window import Window
-from torchcmax.io import Recording, open
+from torchcmax.io import DataNote, Recording, open
 from torchcmax.report import writing
 from torchcmax.simulator import Simulation, simulate
 
 Table = list[dict[str, object]]
+PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
-def best(run: Callable[[], object], device: str, repeats: int = 5) -> tuple[float, float]:
+def best(run: Callable[[], object], device: str, repeats: int = 7) -> tuple[float, float]:
     """Wall and CPU seconds of the fastest of some runs, after one that is not counted."""
 
     def once() -> tuple[float, float]:
@@ -47,63 +55,172 @@ def best(run: Callable[[], object], device: str, repeats: int = 5) -> tuple[floa
     return min(once() for _ in range(repeats))
 
 
-def evaluations(window: Window, model: Model, canvas: Canvas, device: str) -> Table:
-    """(a) Value and gradient of the eight-parameter warp, variance with and without blur: the fast path and its readable twin."""
+@contextmanager
+def without_kernels() -> Iterator[None]:
+    """The plain torch path."""
+    before = os.environ.get(kernels.SWITCH)
+    os.environ[kernels.SWITCH] = "0"
+    try:
+        yield
+    finally:
+        del os.environ[kernels.SWITCH]
+        if before is not None:
+            os.environ[kernels.SWITCH] = before
 
-    def value_and_gradient(how: Callable[..., torch.Tensor], ink: Ink, sigma: float) -> None:
-        owner = torch.arange(len(ink.weight), device=device)
-        x = torch.ones(len(owner), model.size, device=device, requires_grad=True)
-        image = normalized(how(model.homography(x, owner, 0.5), ink, canvas, owner), ink.weight)
-        torch.autograd.grad(CONTRASTS["variance"](blur(image, sigma)).sum(), x)
 
-    rows: Table = []
-    for batch in (1, len(window)):
-        part = window[:batch]
-        ink, events = Ink.of(part, part.weight), part.weight.numel()
-        for name, how in (("grid_sample adjoint", draw), ("scatter_add twin", draw_twin)):
-            for sigma in (0.0, 1.0):
-                wall, _ = best(partial(value_and_gradient, how, ink, sigma), device)
-                rows.append(
-                    {"vote": name, "windows": batch, "events": events, "blur px": sigma, "ns per event": round(wall / events * 1e9, 1)}
-                )
+def joined(window: Window, count: int) -> Window:
+    """The first `count` events of several windows in a row as one window."""
+    dt = window.dt + (window.start - window.start[0])[:, None] * 1e-6
+    ray, dt, polarity = (part.flatten(0, 1)[None, :count] for part in (window.ray, dt.to(window.dt.dtype), window.polarity))
+    return Window(ray.contiguous(), dt.contiguous(), polarity.contiguous(), window.start[:1], dt[:, -1])
+
+
+def evaluations(recording: Recording, window: Window, device: str, threads: list[int]) -> Table:
+    """(a) Value and gradient of the eight-parameter warp on the sensor's own pixels, variance with and without blur."""
+    canvas, model, look, rows = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx), Look(), []
+    for part in (window, joined(window, window.weight.numel()), window[:1]):
+        ink = Ink.of(part, part.weight)
+        owner = torch.arange(len(part), device=device)
+        x = torch.ones(len(part), model.size, device=device)
+        for sigma in (0.0, 1.0):
+            view = View(ink, canvas, sigma, ink.sample(150))
+            for count in threads:
+                with using(count):
+                    times = {backend(device): best(partial(objective(look, model, view, owner), x, owner), device)[0]}
+                    if count == threads[0]:
+                        with without_kernels():
+                            times["torch"] = best(partial(objective(look, model, view, owner), x, owner), device, 3)[0]
+                            if sigma == 0:
+                                times["readable twin"] = best(partial(twin, model, ink, canvas, x), device, 3)[0]
+                for name, wall in times.items():
+                    at = {"backend": name, "threads": count, "windows": len(part), "events": ink.weight.numel(), "blur px": sigma}
+                    rows.append({**at, "ns per event": round(wall / ink.weight.numel() * 1e9, 1)})
     return rows
+
+
+def twin(model: Planar, ink: Ink, canvas: Canvas, x: torch.Tensor) -> torch.Tensor:
+    """The same in plain torch operations, without the guard."""
+    x, owner = x.clone().requires_grad_(), torch.arange(len(x), device=x.device)
+    image = draw_twin(model.homography(x, owner, 0.5), ink, canvas, owner).flatten(1)
+    return torch.autograd.grad(image.var(-1).sum(), x)[0]
+
+
+def backend(device: str) -> str:
+    """What the kernels are made with."""
+    found = kernels.drawing(torch.empty(0, device=device))
+    return "torch" if found is None else "triton" if device != "cpu" else "numba"
+
+
+@contextmanager
+def using(threads: int) -> Iterator[None]:
+    """So many threads, of torch and of the kernels."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def cold_windows(recording: Recording, window: Window, device: str) -> Table:
-    """(b) One window of 30,000 events from a cold start, to convergence."""
+    """(b) One window from a cold start, to convergence; and several in one batch, per window."""
     rows: Table = []
     for name, kind in MODELS.items():
         model = kind(recording.camera.fx)
-        wall, cpu = best(partial(estimate, window[:1], recording.camera, model), device)
-        found = estimate(window[:1], recording.camera, model)
-        rows.append(
-            {
-                "model": name,
-                "wall ms": round(wall * 1e3, 1),
-                "CPU ms": round(cpu * 1e3, 1),
-                "evaluations": int(found.evaluations[0]),
-                "gain": round(found.gain[0].item(), 4),
-                "converged": bool(found.converged[0]),
-            }
-        )
+        for part in (window[:1], window):
+            wall, cpu = best(partial(estimate, part, recording.camera, model), device)
+            found = estimate(part, recording.camera, model)
+            one = {"model": name, "backend": backend(device), "windows": len(part)}
+            rows.append(one | per_window(wall, cpu, found, len(part)))
+        if backend(device) != "torch":
+            with without_kernels():
+                wall, cpu = best(partial(estimate, window[:1], recording.camera, model), device, 1)
+                found = estimate(window[:1], recording.camera, model)
+            rows.append({"model": name, "backend": "torch", "windows": 1} | per_window(wall, cpu, found, 1))
     return rows
 
 
-def whole_recording(recording: Recording, device: str) -> Table:
-    """(c) All windows of a recording, and how much of the time is reading."""
+def per_window(wall: float, cpu: float, found: Estimate, windows: int) -> dict[str, object]:
+    return {
+        "wall ms": round(wall / windows * 1e3, 1),
+        "CPU ms": round(cpu / windows * 1e3, 1),
+        "evaluations": round(found.evaluations.double().mean().item(), 1),
+        "gain": round(found.gain.double().mean().item(), 4),
+        "converged": round(found.converged.double().mean().item(), 2),
+    }
+
+
+def whole_recording(recording: Recording, device: str, threads: list[int]) -> Table:
+    """(c) All windows of a recording, and how much of the time reading alone would take; (d) memory that it adds at its peak."""
     rows: Table = []
     began = time.perf_counter()
-    events = sum(window.weight.numel() for window in recording.windows(30000, batch=16))
+    windows = sum(len(window) for window in recording.windows(30000, batch=16))
     reading = time.perf_counter() - began
+    events = windows * 30000
     for name in MODELS:
-        began = time.perf_counter()
-        options = Compensation(model=name, device=device)  # type: ignore[arg-type]
-        windows = sum(len(window) for window, _ in compensate(recording, options))
-        wall = time.perf_counter() - began
-        rows.append(
-            {"model": name, "windows": windows, "Mev/s": round(events / wall * 1e-6, 3), "reading, share": round(reading / wall, 3)}
-        )
+        for count in threads:
+            options = Compensation(model=name, device=device)  # type: ignore[arg-type]
+            with using(count), Peak(device) as peak:
+                began = time.perf_counter()
+                for _ in compensate(recording, options):
+                    pass
+                wall = time.perf_counter() - began
+            at = {"model": name, "threads": count, "windows": windows, "Mev/s": round(events / wall * 1e-6, 2)}
+            rows.append(at | {"reading alone, share": round(reading / wall, 2), "MB added": round(peak.megabytes)})
     return rows
+
+
+class Peak:
+    """Memory that is taken within a with block beyond what was taken before: of the device, or resident on the CPU."""
+
+    megabytes = 0.0
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def __enter__(self) -> Peak:
+        gc.collect()
+        if self.device != "cpu":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        self._before, self._going = self._now(), True
+        self._watch = threading.Thread(target=self._sample, daemon=True)
+        self._watch.start()
+        return self
+
+    def _now(self) -> float:
+        if self.device != "cpu":
+            return torch.cuda.max_memory_allocated(self.device) / 1e6
+        return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 1e6 if Path("/proc/self/statm").exists() else 0.0
+
+    def _sample(self) -> None:
+        while self._going:
+            self.megabytes = max(self.megabytes, self._now() - self._before)
+            time.sleep(0.01)
+
+    def __exit__(self, *exception: object) -> None:
+        self._going = False
+        self._watch.join()
+
+
+def limits(recording: Recording, window: Window, device: str) -> Table:
+    """(e) What the device can do at best: copying, and adding to four pixels of an image for each event; and our share of it."""
+    canvas, model = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx)
+    ink, owner = Ink.of(window, window.weight), torch.arange(len(window), device=device)
+    events = ink.weight.numel()
+    source = torch.empty(1 << (24 if device == "cpu" else 28), device=device)
+    copy = 2 * source.numel() * 4 / best(lambda: source.clone(), device)[0]
+    pixels = canvas.size[0] * canvas.size[1]
+    place = torch.randint(0, pixels, (len(window), 4 * ink.weight.shape[1]), device=device)
+    image, ones = torch.zeros(len(window), pixels, device=device), torch.ones(place.shape, device=device)
+    added = best(lambda: image.scatter_add_(1, place, ones), device)[0] / events
+    x = torch.ones(len(window), model.size, device=device)
+    view = View(ink, canvas, 0.0, ink.sample(150))
+    ours = best(partial(objective(Look(), model, view, owner), x, owner), device)[0] / events
+    moved = 2 * 16 / ours  # x, y, s, weight, once for the votes and once for the gradient
+    return [
+        {"limit": "copy", "measured": f"{copy * 1e-9:.1f} GB/s", "value and gradient": f"{moved * 1e-9:.1f} GB/s of events read"},
+        {"limit": "four additions to random pixels", "measured": f"{added * 1e9:.2f} ns", "value and gradient": f"{ours * 1e9:.2f} ns"},
+    ]
 
 
 def machine(device: str) -> dict[str, object]:
@@ -115,9 +232,12 @@ def machine(device: str) -> dict[str, object]:
         cpu = next((line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), cpu)
     name = cpu if device == "cpu" else torch.cuda.get_device_name(device)
     versions = {"torchcmax": __version__, "torch": torch.__version__, "python": platform.python_version()}
+    for package in ("numba", "triton"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
     return {
         "device": name,
-        "threads": torch.get_num_threads(),
+        "cores": os.cpu_count(),
         **versions,
         "commit": commit or "unknown",
         "date": time.strftime("%Y-%m-%d"),
@@ -134,23 +254,26 @@ def printed(title: str, rows: Table) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recording", help="default: half a second of the built-in poster")
+    parser.add_argument("--recording", nargs="+", default=[], help="default: half a second of the built-in poster")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--threads", type=int, default=1, help="of torch on the CPU")
-    parser.add_argument("--windows", type=int, default=10, help="windows in the large batch")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="on the CPU")
+    parser.add_argument("--windows", type=int, default=10, help="windows of 30,000 events in a batch")
     parser.add_argument("--json", type=Path, help="write the tables to this file too")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    recording = open(options.recording) if options.recording else simulate(Simulation(duration=0.5))
-    window = next(recording.windows(30000, batch=options.windows)).to(options.device, torch.float32)
+    warnings.simplefilter("ignore", DataNote)
+    threads = options.threads if options.device == "cpu" else [1]
+    torch.set_num_threads(threads[0])
+    recordings = [open(name) for name in options.recording] or [simulate(Simulation(duration=0.5))]
+    first = recordings[0]
+    window = next(first.windows(30000, batch=options.windows)).to(options.device, torch.float32)
     about = machine(options.device)
-    tables = {
-        "One evaluation: value and gradient, 8 parameters": evaluations(
-            window, Planar(recording.camera.fx), Canvas.around(recording.camera), options.device
-        ),
-        "A cold window of 30,000 events": cold_windows(recording, window, options.device),
-        f"The whole of {recording.name}": whole_recording(recording, options.device),
-    }
+    tables = {"One evaluation: value and gradient, 8 parameters": evaluations(first, window, options.device, threads)}
+    for recording in recordings:
+        window = next(recording.windows(30000, batch=options.windows)).to(options.device, torch.float32)
+        tables[f"A cold window of 30,000 events of {recording.name}"] = cold_windows(recording, window, options.device)
+    for recording in recordings:
+        tables[f"The whole of {recording.name}, and memory"] = whole_recording(recording, options.device, threads)
+    tables["What the device can do"] = limits(first, window, options.device)
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     for title, rows in tables.items():
         printed(title, rows)

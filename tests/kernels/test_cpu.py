@@ -229,7 +229,9 @@ def test_motion_homography_guard_and_metric_are_the_twins(kind, reference, scene
             search.homography(there, H)
             np.testing.assert_allclose(there[0], there_twin.turn[row], atol=1e-14)
             np.testing.assert_allclose(H, H_twin[row], rtol=1e-10, atol=1e-12)
-            assert search.guard(there, H, numbers, some) == pytest.approx(cost_twin[row].item(), rel=1e-9, abs=1e-12)
+            assert search.strain(there, H, numbers, some) + search.lean(there, numbers) == pytest.approx(
+                cost_twin[row].item(), rel=1e-9, abs=1e-12
+            )
             G = search.metric(x[row].numpy(), numbers, search.Scene((), some, wall[row].numpy(), *([None] * 4)), 6)
             np.testing.assert_allclose(G, G_twin[row], rtol=1e-8, atol=1e-10)
 

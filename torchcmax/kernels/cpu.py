@@ -6,9 +6,10 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ PART = 50_000  # events for which a second thread pays, where there is one windo
 _own = threading.local()
 
 
-class Problem(NamedTuple):
+@dataclass(frozen=True)
+class Problem:
     """What `search` minimizes: a view of W windows, known normals [W, 3], the look in numbers.
 
     terms: of the polynomial homography.
@@ -37,6 +39,14 @@ class Problem(NamedTuple):
     normal: Tensor
     look: Look
     terms: int
+
+    @cached_property
+    def scene(self) -> Callable[[int], searching.Scene]:
+        """A window of the problem, with scratch that belongs to the thread that asks."""
+        view = self.view
+        rows, some, normal = _rows(view.ink), _rows(view.some), _array(self.normal.double())
+        lens, taps = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x)
+        return lambda window: searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(view.canvas, taps))
 
 
 def votes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor) -> Tensor:
@@ -84,7 +94,7 @@ def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
 
 def evaluate(problem: Problem, x: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
     """Value and gradient of `core.objective`: x [A, P] | owner [A] -> [A], [A, P].  Threads share a window where there are few."""
-    places, scene_of = _array(x.double()), _scenes(problem)
+    places, scene_of = _array(x.double()), problem.scene
     parts = _parts(len(x), problem.view.ink.x.shape[-1])
     values, gradients = np.zeros(len(x)), np.zeros(places.shape)
 
@@ -102,7 +112,7 @@ def evaluate(problem: Problem, x: Tensor, owner: Tensor) -> tuple[Tensor, Tensor
 
 def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slice]) -> tuple[float, Array]:
     """`searching.evaluate` of one window by several threads, each with a frame of its own for its part of the events."""
-    look, frames = problem.look, np.zeros((len(parts), scene.frames[0].size), scene.lens.dtype)
+    look, frames = problem.look, _more_frames(len(parts), scene.frames[0])
     exact, there = searching.homography_at(x, look, scene.normal, problem.terms)
     H, totals = exact.astype(scene.lens.dtype), np.zeros((len(parts), *exact.shape))
     pieces = [tuple(array[part] for array in scene.events) for part in parts]
@@ -112,24 +122,16 @@ def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slic
     searching.develop_slope(scene.kernel, scene.frames, scene.line)
     flat = scene.frames[0].reshape(-1)
     _spread(lambda i: events.draw_slopes(H, pieces[i], scene.lens, flat, totals[i]), [(i,) for i in range(len(parts))])
-    cost = searching.guard(there, exact, look, scene.some)
+    cost = searching.strain(there, exact, look, scene.some) + searching.lean(there, look)
     energy = searching.energy_of(scene.events[3], look.contrast, scene.frames)
     with np.errstate(divide="ignore", invalid="ignore"):  # an empty image has no contrast
         value, to_H = cost - np.log(sharp / energy), totals.sum(0) / -sharp
     return value, searching.chained(x, to_H, look, scene.normal, scene.some)
 
 
-def _scenes(problem: Problem) -> Callable[[int], searching.Scene]:
-    """A window of the problem, with scratch that belongs to the thread that asks."""
-    view = problem.view
-    rows, some, normal = _rows(view.ink), _rows(view.some), _array(problem.normal.double())
-    lens, taps = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x)
-    return lambda window: searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(view.canvas, taps))
-
-
 def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor]:
     """`core.minimize` of `core.objective`, each row in machine code: x [B, P] | owner [B] -> the fields of a Minimum."""
-    start, scene_of = _array(x.double()), _scenes(problem)
+    start, scene_of = _array(x.double()), problem.scene
     limits = searching.Stop(*(getattr(stop, name) for name in searching.Stop._fields))
     found: list[Any] = [None] * len(x)
 
@@ -180,6 +182,15 @@ def _scratch(canvas: Any, taps: Array) -> tuple[Array, Array]:
     return scratch
 
 
+def _more_frames(count: int, like: Array) -> Array:
+    """Empty frames for the parts of a window, [count, pixels]; kept for the next time."""
+    frames: Array | None = getattr(_own, "frames", None)
+    if frames is None or frames.shape != (count, like.size) or frames.dtype != like.dtype:
+        frames = _own.frames = np.empty((count, like.size), like.dtype)
+    frames[:] = 0
+    return frames
+
+
 def _parts(rows: int, count: int) -> list[slice]:
     """A window is cut where there are fewer windows than threads."""
     pieces = 1 if rows >= kernels.threads() else max(1, min(kernels.threads() // max(rows, 1), count // PART))
@@ -188,12 +199,19 @@ def _parts(rows: int, count: int) -> list[slice]:
 
 
 def _spread(work: Callable[..., None], tasks: Sequence[tuple[int, ...]]) -> None:
-    """Do every task, on several threads where there are several."""
-    if min(kernels.threads(), len(tasks)) < 2:
-        for task in tasks:
+    """Do every task, in the order in which threads become free; this thread is one of them."""
+    waiting = iter(tasks)
+
+    def drain() -> None:
+        for task in waiting:  # one thread after the other takes the next: an iterator is safe
             work(*task)
-    else:
-        list(_pool(os.getpid(), kernels.threads()).map(lambda task: work(*task), tasks))
+
+    others = [_pool(os.getpid(), kernels.threads()).submit(drain) for _ in range(min(kernels.threads(), len(tasks)) - 1)]
+    try:
+        drain()
+    finally:
+        for other in others:
+            other.result()
 
 
 @lru_cache(maxsize=1)

@@ -115,8 +115,8 @@ def homography(there, H):
 
 
 @compiled
-def guard(there, H, look, some):
-    """core.objective.penalty, with the deformation that it watches."""
+def strain(there, H, look, some):
+    """What core.objective.penalty watches over at some events: how areas change, and whether a free plane faces them."""
     if look.model == ROTATION:
         return 0.0
     x, y, _, _ = some
@@ -129,16 +129,22 @@ def guard(there, H, look, some):
             a, b, c = a * end + H[k, 2, 0], b * end + H[k, 2, 1], c * end + H[k, 2, 2]
         for i in range(len(x)):
             depth = max(a * x[i] + b * y[i] + c, look.nearest)
-            area = distance * distance / (depth * depth * depth)
-            if area > look.deformation or area * look.deformation < 1:  # a logarithm for the few that need it
-                total += (abs(np.log(area)) - most) ** 2
+            square, cube = distance * distance, depth * depth * depth
+            if square > look.deformation * cube or cube > look.deformation * square:  # a logarithm for the few that need it
+                total += (abs(np.log(square / cube)) - most) ** 2
     cost = look.guard * total / (2 * len(x))
     if look.model == PLANAR:
         n, away = there[2], -np.inf
         for i in range(len(x)):
             away = max(away, n[0] * x[i] + n[1] * y[i] + n[2])
-        cost += look.guard * max(away + look.grazing, 0.0) ** 2 + look.tilt * 2 * (1 + n[2])
+        cost += look.guard * max(away + look.grazing, 0.0) ** 2
     return cost
+
+
+@compiled
+def lean(there, look):
+    """The weak pull of core.objective.penalty on a free plane."""
+    return look.tilt * 2 * (1 + there[2, 2]) if look.model == PLANAR else 0.0
 
 
 @compiled
@@ -239,7 +245,7 @@ def value_at(x, look, scene, energy, H):
     scene.frames[0] = 0
     draw(H, scene.events, scene.lens, scene.frames[0].reshape(-1))
     sharp = develop(look.contrast, scene.kernel, scene.frames, scene.line)
-    return guard(there, exact, look, scene.some) - np.log(sharp / energy), sharp
+    return strain(there, exact, look, scene.some) + lean(there, look) - np.log(sharp / energy), sharp
 
 
 @compiled
@@ -255,13 +261,16 @@ def slope_at(x, sharp, look, scene, H):
 @compiled
 def chained(x, to_H, look, known, some):
     """The derivative of <to_H, H> + guard to x, by central differences of both, which are smooth: -> [P]."""
+    H, there = homography_at(x, look, known, len(to_H))
+    strained = strain(there, H, look, some) > 0  # where it is zero, so is its derivative
     result = np.zeros(len(x))
     for p in range(len(x)):
         for side in (1.0, -1.0):
             near = x.copy()
             near[p] += side * STEP
             H, there = homography_at(near, look, known, len(to_H))
-            result[p] += side * ((to_H * H).sum() + guard(there, H, look, some)) / (2 * STEP)
+            cost = (to_H * H).sum() + lean(there, look) + (strain(there, H, look, some) if strained else 0.0)
+            result[p] += side * cost / (2 * STEP)
     return result
 
 
