@@ -25,9 +25,8 @@ def compiled(function: Callable[..., Any]) -> Any:
         return numba.njit(**options)(function)
 
 
-def forget_stale() -> None:
+def forget_stale(sources: Path = Path(__file__).parent) -> None:
     """Drop kept code that is older than any of the sources: numba looks at the file of the outermost function alone."""
-    sources = Path(__file__).parent
     newest = max(path.stat().st_mtime for path in sources.glob("*.py"))
     for kept in sources.glob("__pycache__/*.nbi"):
         with suppress(FileNotFoundError):  # another process does the same
@@ -44,7 +43,7 @@ class _Say(event.Listener):
         module = sys.modules.get("torchcmax.kernels.compiling")
         if not _Say.said and module is not None and str(event.data["dispatcher"].py_func.__module__).startswith("torchcmax."):
             _Say.said = True
-            log.warning("torchcmax: compiling the kernels for this processor, once; this takes about half a minute")
+            log.warning("torchcmax: compiling the kernels for this processor, once; this takes up to a minute")
 
     def on_end(self, event: Any) -> None:
         pass
