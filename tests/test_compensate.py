@@ -1,10 +1,14 @@
+from itertools import count
+from threading import enumerate as enumerate_threads
+
+import numpy as np
 import pytest
 import torch
 
 from torchcmax.compensate import Compensation, compensate, given_normal, motion_model, true_normal
 from torchcmax.core.camera import Camera
 from torchcmax.core.model import Planar, PlanarKnown, Rotation, Translation
-from torchcmax.io import DataError, Recording, open
+from torchcmax.io import DataError, DataWarning, Events, OpenOptions, Recording, open
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +33,56 @@ def test_windows_come_in_order_whatever_the_batch(recording):
 def test_the_limit_is_kept_and_the_rest_not_even_read(recording):
     parts = list(compensate(recording, Compensation(events=5000, limit=1, batch=16)))
     assert sum(len(window) for window, _ in parts) == 1
+
+
+def test_no_more_than_the_next_batch_is_read_and_the_file_closed(recording):
+    log = []
+
+    def chunks():
+        try:
+            for i in count():
+                log.append(i)
+                yield noisy(2000 * i)
+        finally:
+            log.append("closed")
+
+    endless = Recording(recording.path, "endless", recording.camera, chunks)
+    for options in (Compensation(events=1000, batch=2), Compensation(events=1000, batch=2, limit=2)):
+        log.clear()
+        parts = compensate(endless, options)
+        next(parts)
+        parts.close()
+        assert log in ([0, "closed"], [0, 1, "closed"])  # a chunk is a batch; the next may not have been begun
+        if options.limit:
+            assert 1 not in log
+    assert not [thread for thread in enumerate_threads() if thread.name.startswith("ahead")]
+
+
+def noisy(start):
+    """2000 events at random places."""
+    rng = np.random.default_rng(start)
+    x, y, p = (rng.integers(0, most, 2000).astype(kind) for most, kind in ((240, "u2"), (180, "u2"), (2, "u1")))
+    return Events(start + np.arange(2000), x, y, p)
+
+
+def test_an_error_in_the_file_comes_after_the_windows_before_it(recording):
+    def chunks():
+        yield noisy(0)
+        yield noisy(2000)
+        raise DataError("events.txt", "letters in a column", "mend it", "line 4001")
+
+    parts = compensate(Recording(recording.path, "torn", recording.camera, chunks), Compensation(events=1000, batch=2))
+    assert [len(next(parts)[0]) for _ in range(2)] == [2, 2]
+    with pytest.raises(DataError, match="line 4001"):
+        next(parts)
+
+
+def test_what_is_said_of_the_file_is_said_to_the_caller(demo, tmp_path):
+    text = "".join(f"{i * 1e-5:.6f} {i * 7 % 240} {i * 5 % 180} {i % 2}\n" for i in [*range(500), 520, *range(501, 520), *range(521, 2000)])
+    (tmp_path / "events.txt").write_text(text)
+    late = open(tmp_path, OpenOptions(camera=str(demo / "calib.txt"), sensor=(240, 180)))
+    with pytest.warns(DataWarning, match="19 of 1999 events were out of order"):
+        assert sum(len(window) for window, _ in compensate(late, Compensation(events=500, batch=1))) == 3
 
 
 @pytest.mark.parametrize(

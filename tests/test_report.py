@@ -1,4 +1,5 @@
 import csv
+import io
 import json
 
 import numpy as np
@@ -9,8 +10,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.core.camera import Canvas
+from torchcmax.core.warp import still
 from torchcmax.io import DataError, open
-from torchcmax.report import COLUMNS, Report, at_rest, captioned, coloured, pictures, rows, writing
+from torchcmax.report import COLUMNS, Report, captioned, coloured, pictures, png, rows, writing
 
 HEADER = "index,start_us,end_us,events,contrast_zero,contrast,gain,omega_x,omega_y,omega_z,v_x,v_y,v_z,n_x,n_y,n_z,evaluations,converged"
 
@@ -152,7 +154,7 @@ def test_the_picture_shows_on_red_off_blue_and_both_dark():
 def test_the_second_half_of_a_picture_is_sharper(demo):
     recording, options = open(demo), Compensation(model="planar", limit=1)
     window, estimate = next(compensate(recording, options))
-    drawn = pictures(window, (at_rest(estimate.H_k), estimate.H_k), Canvas.around(recording.camera), 0.5)[0]
+    drawn = pictures(window, (still(estimate.H_k), estimate.H_k), Canvas.around(recording.camera), 0.5)[0]
     for channel in (0, 2):  # red is what blue (OFF) events take away, and blue what red (ON) ones do; squared: the shades are roots
         before, after = np.split((1 - drawn[..., channel] / 255) ** 2, 2, axis=1)
         assert after.var() > 1.3 * before.var()
@@ -162,3 +164,46 @@ def test_rows_have_every_column(results):
     lines = rows(*results[2][0], first=7)
     assert list(lines[0]) == list(COLUMNS)
     assert [line["index"] for line in lines] == [7, 8, 9]
+
+
+def test_a_picture_comes_back_from_png_pixel_by_pixel():
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    back = Image.open(io.BytesIO(png(picture)))
+    assert back.mode == "RGB"
+    np.testing.assert_array_equal(np.asarray(back), picture)
+
+
+def test_the_board_shows_the_same_picture_as_the_file(folder):
+    board = EventAccumulator(str(folder), size_guidance={"images": 0})
+    board.Reload()
+    for event in board.Images("before_after"):
+        assert event.encoded_image_string == (folder / "images" / f"window_{event.step:05d}.png").read_bytes()
+        assert Image.open(io.BytesIO(event.encoded_image_string)).size == (event.width, event.height)
+
+
+def test_the_board_holds_the_numbers_of_the_table_and_no_others(folder):
+    board = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    board.Reload()
+    lines = list(csv.DictReader((folder / "windows.csv").open()))
+    shown = {tag.removeprefix("window/") for tag in board.Tags()["scalars"] if tag.startswith("window/")}
+    assert shown == set(COLUMNS) - {"index", "start_us", "end_us", "events"} | {"events_per_second"}
+    for name in shown & set(COLUMNS):
+        values = [event.value for event in board.Scalars(f"window/{name}")]
+        np.testing.assert_allclose(values, [float(line[name]) for line in lines], rtol=1e-6)
+
+
+def test_what_is_done_can_be_seen_while_the_run_goes_on(results, tmp_path):
+    recording, options, parts = results
+    with Report(tmp_path, recording, options, "", 1) as written:
+        written.add(*parts[0])
+        board = EventAccumulator(str(tmp_path))
+        board.Reload()
+        assert [event.step for event in board.Scalars("window/gain")] == [0, 1, 2]
+
+
+def test_tones_are_of_the_brightest_pixels_but_for_a_few():
+    """On 1000 pixels one is very bright: it does not make the others pale."""
+    on = torch.ones(20, 50)
+    on[0, 0] = 1000
+    picture = coloured(on, torch.zeros(20, 50))
+    assert (picture[1:] == [255, 0, 0]).all()

@@ -17,8 +17,8 @@ import yaml
 from jsonargparse import Namespace
 from tqdm import tqdm
 
-from torchcmax import __version__
-from torchcmax.compensate import Compensation, compensate
+from torchcmax import __version__, kernels
+from torchcmax.compensate import Compensation, compensate, load_kernels
 from torchcmax.config import USAGE_ERROR, Parser, UsageError, command, parser, usage
 from torchcmax.io import DataError, DataNote, DataWarning, OpenOptions, Recording, open, summary
 from torchcmax.report import Report
@@ -54,6 +54,7 @@ def build() -> Parser:
     _add_opening(compensating)
     compensating.add_argument("--out", type=str, required=True, help="folder to write; look at it with: tensorboard --logdir DIR")
     compensating.add_argument("--images", type=int, default=10, help="a picture of every so many windows; 0: none")
+    compensating.add_argument("--threads", type=int, default=0, help="of the CPU's kernels; 0: as many as this process may use")
     compensating.add_argument("--quiet", action="store_true", help="no progress bar")
     compensating.add_class_arguments(Compensation)
     commands.add_subcommand("compensate", compensating, help="estimate the motion of every window, and show it")
@@ -69,7 +70,7 @@ def _add_opening(command: Parser) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; the exit status is returned."""
-    torch.set_num_threads(1)  # one window at a time is too little work for two: they would spin
+    torch.set_num_threads(1)  # what is left to torch is too little work for two: they would spin
     warnings.showwarning = _say
     top = build()
     config = top.parsed(arguments)
@@ -145,7 +146,11 @@ def run_compensate(config: Namespace) -> int:
     check_device(options.device)
     if config.images < 0:
         raise UsageError(f"--images wants a number of at least 0, got {config.images}")
+    if config.threads < 0:
+        raise UsageError(f"--threads wants a number of at least 0, got {config.threads}")
+    kernels.set_threads(config.threads or available_cores())
     recording = open(config.recording, _opening(config))
+    load_kernels(options.device)
     settings = {name: config[name] for name in ("strict", "camera", "sensor", "images")} | dataclasses.asdict(options)
     text = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
     with (
@@ -162,6 +167,11 @@ def run_compensate(config: Namespace) -> int:
         f"curves: tensorboard --logdir {report.folder}"
     )
     return 0
+
+
+def available_cores() -> int:
+    """That this process may use, which may be fewer than there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_device(name: str) -> None:

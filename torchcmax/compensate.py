@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from torchcmax.core.camera import Camera
 from torchcmax.core.estimate import Estimate, Search, estimate
 from torchcmax.core.model import Model, Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look
 from torchcmax.core.window import Window
 from torchcmax.io import DataError, DataWarning, Recording
+from torchcmax.io.ahead import ahead
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Compensation:
     limit: int | None = None
     """Stop after this many windows."""
     batch: int = 16
-    """Windows computed together; memory grows with it."""
+    """Windows computed together; each of 30,000 events takes some 3 MB of memory."""
     device: str = "cpu"
     """cpu, cuda, or cuda:1 and so on."""
     look: Look = field(default_factory=Look)
@@ -68,24 +71,40 @@ def given_normal(plane: str) -> tuple[float, ...] | None:
     return (x / side, y / side, z / side)
 
 
-def compensate(recording: Recording, options: Compensation | None = None) -> Iterator[tuple[Window, Estimate]]:
+def compensate(recording: Recording, options: Compensation | None = None) -> Generator[tuple[Window, Estimate], None, None]:
     """Windows and what they show, batch by batch, in the order of the recording.
 
-    -> Window [B, N] and Estimate [B], float32 on the options' device.  Memory is that of one batch.
+    -> Window [B, N] and Estimate [B], float32 on the options' device.  The next batch is read while one is estimated; memory is
+    that of two batches and of what estimating one takes.
     """
     options = options or Compensation()
+    device = torch.empty(0, device=options.device).device  # which GPU "cuda" means, only the caller's thread knows
+    with closing(ahead(_batches(recording, options, device))) as batches:
+        for window in batches:
+            at_once = window.start[window.duration <= 0]
+            if len(at_once):
+                text = f"{recording.path}: all events of the window at {at_once[0].item()} us have one time, so that no motion can be seen"
+                warnings.warn(DataWarning(text), stacklevel=2)
+            yield window, estimate(window, recording.camera, motion_model(options, recording, window), options.look, options.search)
+
+
+def _batches(recording: Recording, options: Compensation, device: torch.device) -> Generator[Window, None, None]:
+    """As many windows as the options want; not even read are those after them."""
     left = options.limit
     batch = options.batch if left is None else min(left, options.batch)
-    for window in recording.windows(options.events, options.stride, batch):
-        window = window[:left].to(options.device, torch.float32)
-        at_once = window.start[window.duration <= 0]
-        if len(at_once):
-            text = f"{recording.path}: all events of the window at {at_once[0].item()} us have one time, so that no motion can be seen"
-            warnings.warn(DataWarning(text), stacklevel=2)
-        yield window, estimate(window, recording.camera, motion_model(options, recording, window), options.look, options.search)
+    for window in recording.windows(options.events, options.stride, batch, device):
+        yield window[:left]
         left = None if left is None else left - len(window)
-        if left == 0:
+        if left is not None and left <= 0:
             return
+
+
+def load_kernels(device: str) -> None:
+    """Estimate a window of nothing: what is compiled, or loaded, for this device is there afterwards, and later times are of work."""
+    one = torch.ones(1, 16, device=device)
+    ray = torch.stack([0 * one, 0 * one, one], -1)
+    window = Window(ray, one.cumsum(-1) - 1, one, torch.zeros(1, dtype=torch.int64, device=device), 15 * one[:, 0])
+    estimate(window, Camera.pinhole((16, 16)), Rotation(16.0))
 
 
 def motion_model(options: Compensation, recording: Recording, window: Window) -> Model:

@@ -18,7 +18,7 @@ from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.io import DataWarning, Events, OpenOptions, Recording, open, save
 from torchcmax.io.checked import Source, checked
-from torchcmax.io.text import read_text
+from torchcmax.io.text import _plain, read_text
 
 DAVIS = Camera((180, 240), 199.09, 198.83, 132.19, 110.71, (-0.3684, 0.1509, -0.000296, -0.000759, 0.0))
 FISHEYE = Camera((60, 80), 40.0, 41.0, 39.5, 29.5, (0.01, -0.002, 0.0003, 0.0), "kannala_brandt")
@@ -135,6 +135,28 @@ def test_events_moved_by_less_than_a_chunk_are_put_back_stably(data, chunk):
 def test_times_are_exact_to_the_microsecond(tmp_path, text, microseconds):
     (tmp_path / "events.txt").write_text(f"{text} 1 2 1\n")
     assert next(read_text(tmp_path / "events.txt", 10)).t.tolist() == [microseconds]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("digits", [(6, 6), (6, 9), (7, 9), (9, 9), (1, 5), (1, 9)])
+def test_many_plain_lines_are_exact_to_the_microsecond(end, digits):
+    """However many digits stand behind the dots; what is beyond the sixth is rounded, half up."""
+    rng = np.random.default_rng(digits)
+    micro, beyond = rng.integers(0, 10**9, 500), rng.choice([50, 450, 550, 950], 500)  # nanoseconds
+    width = rng.integers(digits[0], digits[1] + 1, 500)
+    exact = micro - micro % 10 ** np.maximum(6 - width, 0)
+    seconds = [f"{m // 10**6}.{f'{m % 10**6:06d}{b:03d}'[:w]}" for m, b, w in zip(exact, beyond, width, strict=True)]
+    up = (width > 6) & (beyond > 500)
+    x, y, p = (rng.integers(0, most, 500) for most in (240, 180, 2))
+    lines = "".join(f"{s} {a} {b} {c}{end}" for s, a, b, c in zip(seconds, x, y, p, strict=True)).encode()
+    same(_plain(lines), Events(exact + up, x.astype("u2"), y.astype("u2"), p.astype("u1")))
+
+
+@pytest.mark.parametrize("line", [b"1.0 2 3 1\r5\n", b"1.0 2 3\r1 \n", b"1.0 2 3 1\n\r", b"1 0.2 3 1\r\n"])
+def test_marks_in_another_place_are_not_read_as_plain_lines(line):
+    good = b"1.0 2 3 1\r\n"
+    assert _plain(good + good) is not None
+    assert _plain(good + line) is None
 
 
 def test_tabs_spaces_and_floats_that_are_whole_are_read(tmp_path):

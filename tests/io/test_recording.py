@@ -8,6 +8,7 @@ import torch
 
 from torchcmax.core.camera import Camera
 from torchcmax.io import DataError, Events, Recording
+from torchcmax.io.events import Packed
 
 CAMERA = Camera((5, 7), 6.0, 6.5, 3.0, 2.0)
 
@@ -59,3 +60,56 @@ def test_fewer_events_than_a_window_is_said(count):
 def test_windows_of_no_sense_are_refused(arguments):
     with pytest.raises(ValueError, match="at least"):
         next(recording(some_events(50), 7).windows(*arguments))
+
+
+def test_events_off_the_sensor_are_refused_and_not_taken_for_others():
+    events = some_events(50)
+    events.x[20] = 7  # of a sensor that is 7 wide: would be the first pixel of the next row
+    with pytest.raises(ValueError, match=r"pixel \(7, 4\) are not on the sensor of 7 x 5"):
+        next(recording(events, 50).windows(50))
+
+
+@pytest.mark.parametrize("length", [(1 << 31) - 1, 1 << 31, 1 << 40])
+def test_windows_may_last_longer_than_half_an_hour(length):
+    t = np.array([-5, 12, length - 5])
+    events = Events(t, np.zeros(3, "u2"), np.zeros(3, "u2"), np.ones(3, "u1"))
+    (window,) = recording(events, 3).windows(3)
+    np.testing.assert_allclose(window.dt[0], (t + 5) * 1e-6, rtol=1e-7)
+    assert window.start.tolist() == [-5]
+
+
+@pytest.mark.parametrize("bits", [23, 24])
+def test_microseconds_are_told_apart_as_far_as_float32_can(bits):
+    t = (1 << bits) - np.arange(1000, 0, -1)
+    events = Events(np.concatenate([[0], t]), *(np.zeros(1001, kind) for kind in ("u2", "u2", "u1")))
+    (window,) = recording(events, 1001).windows(1001)
+    np.testing.assert_array_equal(window.dt[0, 1:].numpy(), (t * 1e-6).astype(np.float32))
+
+
+def test_events_go_to_the_device_in_nine_bytes():
+    events = some_events(60)
+    packed = Packed.of(events.strided(20, 20), CAMERA.size)
+    assert sum(getattr(packed, name).element_size() for name in ("pixel", "offset", "polarity")) == 9
+    assert packed.pixel.flatten().tolist() == (events.y.astype(int) * 7 + events.x).tolist()
+
+
+def test_windows_come_to_the_device_that_is_asked_for(device):
+    for window in recording(some_events(203), 64).windows(10, 7, 3, device):
+        kinds = {getattr(window, name).device.type for name in ("ray", "dt", "polarity", "start", "duration")}
+        assert kinds == {device.type}
+
+
+def test_the_file_is_closed_when_nobody_wants_more_windows():
+    closed = []
+
+    def chunks():
+        try:
+            while True:
+                yield some_events(50)
+        finally:
+            closed.append(True)
+
+    windows = Recording(Path("r"), "r", CAMERA, chunks).windows(20)
+    next(windows)
+    windows.close()
+    assert closed

@@ -54,15 +54,22 @@ class Camera:
 
     def project(self, ray: Tensor) -> Tensor:
         """Rays to distorted sensor pixels: ray [M, 3] -> [M, 2] px."""
-        from kornia.geometry import calibration, camera  # 0.5 s, so only where it is needed
-
         k, coefficients = self._kornia(ray)
         point = (ray[..., :2] / ray[..., 2:]).double()
+        pixel = point * k.diagonal()[:2] + k[:2, 2]
+        if self._straight:
+            return pixel.to(ray)
+        from kornia.geometry import calibration, camera  # 0.5 s, so only where it is needed
+
         if self.model == "plumb_bob":
-            pixel = point * k.diagonal()[:2] + k[:2, 2]
             return calibration.distort_points(pixel[None], k[None], coefficients[None])[0].to(ray)
         params = ray.new_tensor([self.fx, self.fy, self.cx, self.cy, *self.distortion], dtype=torch.float64)
         return camera.distort_points_kannala_brandt(point, params).to(ray)
+
+    @property
+    def _straight(self) -> bool:
+        """Whether the lens bends nothing."""
+        return self.model == "plumb_bob" and not any(self.distortion)
 
     def rays(self) -> Tensor:
         """Ray (x, y, 1) of every sensor pixel, exact to 1e-3 px: -> [H, W, 3] float64, computed once per camera."""
@@ -89,10 +96,12 @@ def _table(camera: Camera) -> Tensor:
 
 def _undistort(camera: Camera, pixel: Tensor) -> Tensor:
     """Distorted pixels [M, 2] to points on the plane z = 1, by kornia with enough rounds for the table's error."""
+    k, coefficients = camera._kornia(pixel)
+    if camera._straight:
+        return (pixel - k[:2, 2]) / k.diagonal()[:2]
     from kornia.geometry import calibration
     from kornia.geometry.camera import undistort_points_kannala_brandt
 
-    k, coefficients = camera._kornia(pixel)
     if camera.model == "kannala_brandt":
         params = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion], dtype=torch.float64)
         return undistort_points_kannala_brandt(pixel, params)

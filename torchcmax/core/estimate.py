@@ -97,9 +97,9 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
 
 
 def starts(window: Window, model: Model, far: float) -> Tensor:
-    """Where each window's search begins: at rest, and with a displacement to four sides: -> [B * S, P] px."""
+    """Where each window's search begins: at rest, and with a displacement to four sides: -> [B * S, P] px, float64."""
     sides = [[0, 0, 0], [far, 0, 0], [-far, 0, 0], [0, far, 0], [0, -far, 0]] if far > 0 else [[0, 0, 0]]
-    x = window.ray.new_zeros(len(sides), model.size)
+    x = torch.zeros(len(sides), model.size, dtype=torch.float64, device=window.ray.device)
     x[:, :3] = x.new_tensor(sides)  # of a turn or of a shift, whichever the model has first: both move the image
     return x.repeat(len(window), 1)
 
@@ -143,7 +143,7 @@ def _mended(found: Minimum, rows: Tensor, again: Minimum) -> Minimum:
 def rates(displacement: Displacement, window: Window) -> Motion:
     """Displacement over the window -> rad/s and plane distances/s; nothing where the window has no duration."""
     per_second = torch.where(window.duration > 0, 1 / torch.where(window.duration > 0, window.duration, 1.0), 0.0)[:, None]
-    return Motion(displacement.turn * per_second, displacement.shift * per_second)
+    return Motion(*((moved * per_second).to(per_second) for moved in (displacement.turn, displacement.shift)))
 
 
 def _report(window: Window, model: Model, look: Look, view: View, rounds: list[Minimum], zero: Tensor) -> Estimate:
@@ -153,16 +153,16 @@ def _report(window: Window, model: Model, look: Look, view: View, rounds: list[M
     x = torch.where(seen[:, None], found.x, 0.0)
     there = model.at_reference(x, owner, reference)
     H_k = there.homography()
-    cost = penalty(look, model, there, H_k, view.some.ray)
+    cost = penalty(look, model, there, H_k, view.some.ray.to(x))
     displacement = model.displacement(x, owner)
     return Estimate(
         motion=rates(displacement, window),
-        normal=displacement.normal if model.has_plane else None,
-        H_k=H_k,
+        normal=displacement.normal.to(zero) if model.has_plane else None,
+        H_k=H_k.to(zero),
         contrast_zero=zero,
-        contrast=torch.where(seen, (cost - found.value).exp(), zero),
+        contrast=torch.where(seen, (cost - found.value).exp().to(zero), zero),
         iterations=torch.stack([r.iterations for r in rounds]).sum(0),
         evaluations=torch.stack([r.evaluations for r in rounds]).sum(0),
         converged=found.converged & seen,
-        traces=tuple((-r.trace).exp() for r in rounds),
+        traces=tuple((-r.trace).exp().to(zero) for r in rounds),
     )

@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""x [A, P], rows [A] -> value [A], gradient [A, P]: line i depends on x[i] alone and belongs to problem rows[i]."""
+"""x [A, P], rows [A] -> value [A], gradient [A, P]: line i depends on x[i] alone and belongs to problem rows[i].
+
+The value may be less precise than x; how precise its type is decides which differences are taken for noise.
+"""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class _Rows:
         self.x, self.value, self.gradient, self.metric, self.stop = x.clone(), value, gradient, metric, stop
         self.plain = self.inverse = torch.linalg.inv(metric)  # inverse Hessian as long as nothing is known of the curvature
         self.step = torch.zeros_like(x)
-        self.length = self.low = self.high = torch.zeros_like(value)
+        self.length = self.low = self.high = torch.zeros_like(x[:, 0])
         self.iterations = self.trials = torch.zeros_like(value, dtype=torch.int64)
         self.scaled, self.converged = torch.zeros_like(value, dtype=torch.bool), gradient.abs().amax(-1) == 0
         self.done = self.converged | ~value.isfinite()
@@ -126,7 +129,7 @@ def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop
         found = objective(x_new[rows], rows)
         value_new, gradient_new = (old.index_copy(0, rows, new) for old, new in zip((value, state.gradient), found, strict=True))
         slope, slope_new = (state.gradient * step).sum(-1), (gradient_new * step).sum(-1)
-        slack = 4 * torch.finfo(x.dtype).eps * value.abs()
+        slack = 4 * torch.finfo(value.dtype).eps * value.abs()
         too_long = ~(value_new <= value + stop.armijo * length * slope + slack)  # also where it is nan
         good = going & ~too_long & ~((slope_new < stop.wolfe * slope) & (length < state.limit))  # else it is too short
         parabola = -slope * length * length / (2 * (value_new - value - slope * length))  # through both values and the slope

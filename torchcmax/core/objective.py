@@ -123,21 +123,24 @@ def penalty(look: Look, model: Model, there: Displacement, H_k: Tensor, ray: Ten
 
 
 def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
-    """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to."""
+    """-log contrast + guard, with its gradient, for `minimize`: owner [B] says which window of the view a row belongs to.
+
+    Parameters are meant to be float64, whatever the images are: twelve numbers cost nothing, and the search is that of the kernels.
+    """
     numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x)
     if numbers is not None and kernel is not None:
         return lambda x, rows: kernel.evaluate(numbers, x, owner[rows])
-    ray = view.some.ray
+    ray = view.some.ray.double()
 
     def evaluate(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         x = x.detach().requires_grad_()
         with torch.enable_grad():
             there = model.at_reference(x, owner[rows], REFERENCES[look.reference])
             H_k = there.homography()
-            contrast = look.sharpness(H_k, view, owner[rows])
-            value = penalty(look, model, there, H_k, ray[owner[rows]]) - contrast.log()
+            contrast = look.sharpness(H_k.to(view.ink.x), view, owner[rows])
+            value = penalty(look, model, there, H_k, ray[owner[rows]]) - contrast.to(x).log()
             (gradient,) = torch.autograd.grad(value.sum(), x)
-        return value.detach(), gradient
+        return value.detach().to(contrast), gradient
 
     return evaluate
 
@@ -153,7 +156,7 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
     each = owner.repeat_interleave(2 * parameters)
     flat = model.homography(nearby, each, REFERENCES[look.reference]).transpose(1, 2).flatten(2)
-    ray = (flat[..., None] * some.basis[each][:, None]).sum(2)  # no matrix products here, which round differently in another batch
+    ray = (flat[..., None] * some.basis[each][:, None].to(x)).sum(2)  # no matrix products here, which round differently in another batch
     flow = (ray[:, :2] / ray[:, 2:].clamp_min(NEAREST) * model.focal).view(len(x), 2, parameters, -1)
     J = (flow[:, 0] - flow[:, 1]) / 2 * (some.weight[owner] != 0).to(x)[:, None].repeat(1, 1, 2)
     G = (J[:, :, None] * J[:, None]).sum(-1) / events

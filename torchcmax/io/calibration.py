@@ -14,8 +14,8 @@ import yaml
 
 from torchcmax.core.camera import MODELS, Camera
 from torchcmax.io.errors import DataError, DataWarning
+from torchcmax.io.events import Events
 from torchcmax.io.member import Member, not_a_file, text_lines, text_of
-from torchcmax.io.recording import Events
 
 SENSORS = ((128, 128), (240, 180), (304, 240), (346, 260), (480, 360), (640, 480), (1280, 720))  # width, height px, smallest first
 OFF_CENTRE = 0.15  # of the sensor: how far from the middle a principal point is believed to be; 0.12 in the ECD

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from torchcmax.io.errors import DataError, DataNote, DataWarning
-from torchcmax.io.recording import Events
+from torchcmax.io.errors import DataError, DataNote, DataWarning, tell
+from torchcmax.io.events import Events
 
 SORT = "sort -s -n -k1,1 events.txt > sorted.txt"
 
@@ -45,9 +44,8 @@ def _on_sensor(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
     """Passes events on and stops at the first that is not on the sensor."""
     (width, height), seen = source.sensor, 0
     for chunk in chunks:
-        outside = (chunk.x >= width) | (chunk.y >= height)
-        if outside.any():
-            i = int(outside.argmax())
+        if len(chunk) and (chunk.x.max() >= width or chunk.y.max() >= height):
+            i = int(((chunk.x >= width) | (chunk.y >= height)).argmax())
             x, y = int(chunk.x[i]), int(chunk.y[i])
             raise DataError(
                 source.path,
@@ -68,18 +66,17 @@ def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
             if not len(chunk):
                 continue
             newest = chunk.t[0] if held is None else held.t[-1]
-            before = np.concatenate([newest[None], chunk.t[:-1]])
             if source.strict:
-                _refuse(chunk, before, seen, source)
-            if (chunk.t >= before).all():
+                _refuse(chunk, _before(chunk, newest), seen, source)
+            if chunk.t[0] >= newest and (chunk.t[1:] >= chunk.t[:-1]).all():
                 ready, held = held, chunk
             else:
-                behind = np.flatnonzero(chunk.t < np.maximum.accumulate(before))
+                behind = np.flatnonzero(chunk.t < np.maximum.accumulate(_before(chunk, newest)))
                 if chunk.t.min() < handed:
                     raise _too_late(chunk, handed, seen, source)
                 late, where = late + len(behind), where or source.place(seen + int(behind[0]))
                 ready, held = _merged(held, chunk)
-            equal += int((chunk.t == before).sum()) - (seen == 0)  # the first of all has none before it
+            equal += int((chunk.t[1:] == chunk.t[:-1]).sum()) + int(seen > 0 and chunk.t[0] == newest)
             seen += len(chunk)
             if ready is not None and len(ready):
                 handed = int(ready.t[-1])
@@ -89,10 +86,15 @@ def _in_order(chunks: Iterator[Events], source: Source) -> Iterator[Events]:
     finally:  # also when nobody wants the rest of the events
         if late:
             text = f"{source.path}: {late} of {seen} events were out of order and have been sorted, the first at {where}"
-            warnings.warn(Reordered(text, late), stacklevel=2)
+            tell(Reordered(text, late))
         if equal:
             text = f"{source.path}: {equal} of {seen} events have the time of the one before; they stay in the order of the file"
-            warnings.warn(DataNote(f"{text} (--strict refuses them)"), stacklevel=2)
+            tell(DataNote(f"{text} (--strict refuses them)"))
+
+
+def _before(chunk: Events, newest: np.int64) -> np.ndarray:
+    """The time of the event before each of a chunk, `newest` before the first."""
+    return np.concatenate([[newest], chunk.t[:-1]])
 
 
 def _merged(held: Events | None, chunk: Events) -> tuple[Events, Events]:

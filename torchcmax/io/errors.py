@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from contextvars import ContextVar
 from pathlib import Path
 
 
@@ -20,3 +22,18 @@ class DataWarning(UserWarning):
 
 class DataNote(UserWarning):
     """Something in a file that is worth knowing and changes nothing."""
+
+
+LATER: ContextVar[list[Warning] | None] = ContextVar("LATER", default=None)
+
+
+def tell(warning: Warning) -> None:
+    """Warns of something in a file; a thread that reads ahead only notes it in LATER, for whoever it reads for.
+
+    `warnings` belongs to the whole process: told from another thread, a warning would meet the filters of any moment.
+    """
+    later = LATER.get()
+    if later is None:
+        warnings.warn(warning, stacklevel=3)
+    else:
+        later.append(warning)

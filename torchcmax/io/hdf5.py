@@ -20,7 +20,8 @@ from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
 from torchcmax.io.calibration import Lens, told_lens
 from torchcmax.io.errors import DataError
-from torchcmax.io.recording import LATEST, Events, Recording
+from torchcmax.io.events import LATEST, Events
+from torchcmax.io.recording import Recording
 from torchcmax.io.trajectory import checked_plane, checked_trajectory
 
 NAMES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}

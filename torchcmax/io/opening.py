@@ -18,9 +18,10 @@ from torchcmax.core.pose import Trajectory
 from torchcmax.io.calibration import ECD_FORM, Lens, checked_size, guess_sensor, read_lens
 from torchcmax.io.checked import Source, checked
 from torchcmax.io.errors import DataError, DataWarning
+from torchcmax.io.events import Events
 from torchcmax.io.hdf5 import Contents, read_contents, read_events
 from torchcmax.io.member import GZIP, UTF16, Member, image_size, not_a_file, open_zip, reading
-from torchcmax.io.recording import Events, Recording
+from torchcmax.io.recording import Recording
 from torchcmax.io.text import NUMBER, check_text, line_of, read_text
 from torchcmax.io.trajectory import read_plane, read_trajectory
 

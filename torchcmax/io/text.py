@@ -13,14 +13,14 @@ from typing import IO
 import numpy as np
 
 from torchcmax.io.errors import DataError
+from torchcmax.io.events import LATEST, Events
 from torchcmax.io.member import Member, reading, refuse_foreign, size_in_bytes
-from torchcmax.io.recording import LATEST, Events
 
 BLOCK = 1 << 20  # bytes taken apart at a time: fits the processor's cache
 LONGEST = 1 << 16  # bytes of a line; more is no text of events
 FORM = "t x y p, separated by blanks: seconds, column, row, 0 or 1, like 0.003811 96 133 0"
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-BETWEEN = np.frombuffer(b".   \n", np.uint8)  # what stands between the digits of a line: 1.234567 12 34 1
+BETWEEN = (b".   \n", b".   \r\n")  # what stands between the digits of a line: 1.234567 12 34 1
 MOST = (12, 5, 5, 1)  # digits of whole seconds, column, row, polarity
 SPELLINGS = ((b"\r\n", b"\n"), (b"\t", b" "), (b" -1\n", b" 0\n"))
 
@@ -130,12 +130,12 @@ def _parse(text: bytes, line: int, file: Member) -> tuple[Events, int]:
 def _plain(text: bytes) -> Events | None:
     """Lines of digits like `1.234567 12 34 1`, all at once, twice as fast as np.loadtxt; None where one line is of another form."""
     digit = np.frombuffer(text, np.uint8) - np.uint8(48)
-    other = np.flatnonzero(digit > 9).astype(np.int32)
-    if len(other) % 5 or (digit[other].reshape(-1, 5) != BETWEEN - np.uint8(48)).any():
+    found = _between(digit, BETWEEN[b"\r\n" in text[:LONGEST]])
+    if found is None:
         return None
-    dot, *end = other.reshape(-1, 5).T.copy()
-    first = np.concatenate([np.zeros(1, np.int32), end[3][:-1] + np.int32(1)])
-    starts = [first, *(before + np.int32(1) for before in end[:3])]
+    dot, *end, last = found
+    first = np.concatenate([[0], last[:-1] + 1])
+    starts = [first, *(before + 1 for before in end[:3])]
     widths = [stop - start for start, stop in zip(starts, [dot, *end[1:]], strict=True)]
     if any(width.min() < 1 for width in [*widths, end[0] - dot - 1]) or any(w.max() > most for w, most in zip(widths, MOST, strict=True)):
         return None
@@ -144,6 +144,22 @@ def _plain(text: bytes) -> Events | None:
         return None
     t = _whole(digit, widths[0], dot, np.int64) * 1_000_000 + _millionths(digit, dot, end[0])
     return Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
+
+
+def _between(digit: np.ndarray, marks: bytes) -> list[np.ndarray] | None:
+    """Where the dots, the blanks after seconds, column and row, the ends of the polarities and the line feeds are: six rows.
+
+    None where anything but these marks stands between the digits of a line.
+    """
+    other = np.flatnonzero(digit > 9)
+    if len(other) % len(marks):
+        return None
+    place = list(other.reshape(-1, len(marks)).T.copy())
+    if any((digit.take(row) != (mark - 48) % 256).any() for row, mark in zip(place, marks, strict=True)):
+        return None
+    if len(marks) > 5 and (place[5] != place[4] + 1).any():
+        return None
+    return [*place[:5], place[-1]]
 
 
 def _whole(digit: np.ndarray, width: np.ndarray, end: np.ndarray, dtype: type[np.signedinteger]) -> np.ndarray:
@@ -159,13 +175,17 @@ def _whole(digit: np.ndarray, width: np.ndarray, end: np.ndarray, dtype: type[np
 def _millionths(digit: np.ndarray, dot: np.ndarray, end: np.ndarray) -> np.ndarray:
     """The six digits behind the dot, rounded by the seventh: exact, however large the number before the dot."""
     width = end - dot - 1
-    least = width.min()
+    least, most = width.min(), width.max()
     value = np.zeros(len(dot), np.int32)
-    for k in range(1, 8):
-        place = digit.take(dot + k, mode="clip")
-        place = place * (k <= width) if k > least else place
-        value = value * np.int32(10) + place if k < 7 else value + (place >= 5)
-    return value
+    if least >= 6:
+        pair = digit[:-1] * np.uint8(10) + digit[1:]  # two digits at a time; nonsense where a mark is one of them
+        for k in (1, 3, 5):
+            value = value * np.int32(100) + pair.take(dot + k)
+    else:
+        for k in range(1, 7):
+            place = digit.take(dot + k, mode="clip")
+            value = value * np.int32(10) + (place * (k <= width) if k > least else place)
+    return value + ((digit.take(dot + 7, mode="clip") >= 5) & (width >= 7)) if most >= 7 else value
 
 
 def _by_line(text: bytes, line: int, file: Member) -> Events:

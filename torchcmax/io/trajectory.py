@@ -13,8 +13,8 @@ from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose, Trajectory
 from torchcmax.io.errors import DataError
+from torchcmax.io.events import LATEST
 from torchcmax.io.member import LARGE, SMALL, Member, text_lines, text_of
-from torchcmax.io.recording import LATEST
 
 TUM = "t tx ty tz qx qy qz qw"
 VELOCITY = "t[s]  v_x v_y v_z [m/s]  w_x w_y w_z [rad/s]   (body frame = camera frame)"

@@ -12,13 +12,11 @@ from torchcmax.kernels.compiling import compiled
 CONTRASTS = ("variance", "mean_square", "high_pass", "michelson", "gradient_magnitude")
 
 
-@compiled
 def taps(sigma):
     """Half of the Gaussian kernel, cut at 3 sigma: -> [radius + 1]; the middle alone for sigma 0."""
-    radius = max(1, round(3 * sigma)) if sigma > 0 else 0
-    kernel = np.ones(radius + 1)
-    for i in range(1, radius + 1):
-        kernel[i] = np.exp(-(i * i) / (2 * sigma * sigma))
+    if sigma <= 0:
+        return np.ones(1)
+    kernel = np.exp(-(np.arange(max(1, round(3 * sigma)) + 1) ** 2) / (2 * sigma * sigma))
     return kernel / (2 * kernel.sum() - 1)
 
 
