@@ -19,6 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,7 +30,7 @@ from torchcmax import __version__, kernels
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.core.camera import Canvas
 from torchcmax.core.draw import Ink, draw_twin
-from torchcmax.core.estimate import Estimate, estimate
+from torchcmax.core.estimate import Estimate, Search, estimate
 from torchcmax.core.model import MODELS, Planar
 from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.window import Window
@@ -132,6 +133,13 @@ def cold_windows(recording: Recording, window: Window, device: str) -> Table:
             found = estimate(part, recording.camera, model)
             one = {"model": name, "backend": backend(device), "windows": len(part)}
             rows.append(one | per_window(wall, cpu, found, len(part)))
+        if len(window) > 1:
+            last = found.displacement(window)
+            warm, one_round = replace(model, start=model.parameters(last).roll(1, 0)), Search((1.0,))
+            run = partial(estimate, window, recording.camera, warm, None, one_round)
+            wall, cpu = best(run, device)
+            row = {"model": f"{name}, from the window before", "backend": backend(device), "windows": len(window)}
+            rows.append(row | per_window(wall, cpu, run(), len(window)))
         if backend(device) != "torch":
             with without_kernels():
                 wall, cpu = best(partial(estimate, window[:1], recording.camera, model), device, 1)

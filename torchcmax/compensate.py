@@ -19,6 +19,8 @@ from torchcmax.core.window import Window
 from torchcmax.io import DataError, DataWarning, Recording
 from torchcmax.io.ahead import ahead
 
+BATCH = {"cpu": 16, "gpu": 512}  # windows: enough to keep the cores busy, or to make little of what it costs to begin a kernel
+
 
 @dataclass(frozen=True)
 class Compensation:
@@ -35,8 +37,8 @@ class Compensation:
     """Events from the start of one window to the next; default: the windows lie end to end."""
     limit: int | None = None
     """Stop after this many windows."""
-    batch: int = 16
-    """Windows computed together; each of 30,000 events takes some 3 MB of memory."""
+    batch: int | None = None
+    """Windows computed together; each of 30,000 events takes some 3 MB of memory. Default: 16 on a CPU, 512 on a GPU."""
     device: str = "cpu"
     """cpu, cuda, or cuda:1 and so on."""
     look: Look = field(default_factory=Look)
@@ -91,7 +93,8 @@ def compensate(recording: Recording, options: Compensation | None = None) -> Gen
 def _batches(recording: Recording, options: Compensation, device: torch.device) -> Generator[Window, None, None]:
     """As many windows as the options want; not even read are those after them."""
     left = options.limit
-    batch = options.batch if left is None else min(left, options.batch)
+    most = options.batch or BATCH["cpu" if device.type == "cpu" else "gpu"]
+    batch = most if left is None else min(left, most)
     for window in recording.windows(options.events, options.stride, batch, device):
         yield window[:left]
         left = None if left is None else left - len(window)
@@ -117,8 +120,8 @@ def motion_model(options: Compensation, recording: Recording, window: Window) ->
     kind = Translation if options.model == "translation" else PlanarKnown
     given = given_normal(options.plane)
     if given is not None:
-        return kind(focal, torch.tensor(given).expand(len(window), 3))
-    return kind(focal, true_normal(recording, window.start) if options.plane == "truth" else None)
+        return kind(focal, torch.tensor(given, device=window.ray.device).expand(len(window), 3))
+    return kind(focal, true_normal(recording, window.start).to(window.ray.device) if options.plane == "truth" else None)
 
 
 def true_normal(recording: Recording, start: Tensor) -> Tensor:

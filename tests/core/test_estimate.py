@@ -1,11 +1,13 @@
 """The whole estimator on real windows and on simulated ones with exact truth: the bars that the project set itself."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from accuracy import FAST, ROTATIONS, end_point_error, from_random_starts, sample, whole
 
+from torchcmax import kernels
 from torchcmax.core.estimate import Search, estimate
 from torchcmax.core.model import MODELS, Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look
@@ -210,3 +212,41 @@ def test_short_windows_are_never_worse_than_at_rest_and_show_planes_that_the_cam
         assert (found.gain >= 0.999).all()  # less the little that the pull of the plane may cost
         unseen = (window.ray @ found.normal[..., None])[..., 0] > 0
         assert (unseen.float().mean(-1) < 0.1).all()
+
+
+REAL = [*(f"real/ecd/{name}" for name in ROTATIONS), "sim/poster_6dof_sim", "sim/rotation_panorama_sim"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_every_backend_gives_the_same_answer(shared, monkeypatch, name):
+    """Contrast within 1e-4, angular velocity within 0.05 degrees a second; with the kernels and without."""
+    pytest.importorskip("numba", reason="numba is not installed")
+    recording = open(shared / "data" / name)
+    window = next(recording.windows(min(20_000, recording.count or 20_000), batch=2))
+    fast = estimate(window, recording.camera, Rotation(recording.camera.fx))
+    monkeypatch.setenv(kernels.SWITCH, "0")
+    plain = estimate(window, recording.camera, Rotation(recording.camera.fx))
+    torch.testing.assert_close(fast.contrast, plain.contrast, rtol=1e-4, atol=0)
+    torch.testing.assert_close(fast.motion.omega, plain.motion.omega, rtol=0, atol=math.radians(0.05))
+
+
+def test_a_window_that_begins_where_the_one_before_ended_takes_fewer_evaluations(built_in):
+    camera, window = built_in
+    for kind in (Rotation, PlanarKnown):
+        model = kind(camera.fx)
+        cold = estimate(window, camera, model)
+        start = model.parameters(cold.displacement(window)).roll(1, 0)
+        warm = estimate(window, camera, replace(model, start=start), None, Search((1.0,)))
+        assert warm.evaluations[1:].sum() < 0.8 * cold.evaluations[1:].sum()
+        assert (warm.contrast[1:] > 0.99 * cold.contrast[1:]).all()
+
+
+def test_what_is_not_sharper_than_rest_is_searched_for_again_from_there(built_in):
+    camera, window = built_in
+    model = Rotation(camera.fx)
+    lost = torch.zeros(4, 3)
+    lost[2] = 300.0  # px, off the canvas
+    found = estimate(window, camera, replace(model, start=lost), None, Search((1.0,)))
+    assert (found.gain > 1).all()
+    assert found.evaluations[2] > found.evaluations[0]

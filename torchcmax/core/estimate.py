@@ -16,7 +16,7 @@ from torchcmax.core.pose import Motion
 from torchcmax.core.warp import TERMS, still
 from torchcmax.core.window import Window
 
-COARSE = 8.0  # a blurred round is done when a step is shorter than so many tolerances for each px of blur
+COARSE = 4.0  # a blurred round is done when a step is shorter than so many tolerances for each px of blur
 WIDEST = 32.0  # px: blur beyond it leaves nothing of an image
 
 
@@ -65,6 +65,13 @@ class Estimate:
         motion, traces = Motion(self.motion.omega[index], self.motion.velocity[index]), tuple(trace[index] for trace in self.traces)
         return replace(self, **chosen, motion=motion, traces=traces)
 
+    def displacement(self, window: Window) -> Displacement:
+        """The motion over each of these windows, or of others that are as long; a fronto-parallel plane where none was estimated."""
+        wall = torch.zeros_like(self.motion.omega)
+        wall[:, 2] = -1
+        seconds = window.duration[:, None]
+        return Displacement(self.motion.omega * seconds, self.motion.velocity * seconds, wall if self.normal is None else self.normal)
+
     @property
     def gain(self) -> Tensor:
         """Contrast over the contrast at zero motion: [B]."""
@@ -74,6 +81,7 @@ class Estimate:
 def estimate(window: Window, camera: Camera, model: Model, look: Look | None = None, search: Search | None = None) -> Estimate:
     """The motion that makes each window sharpest; every window by itself, all in one batch.
 
+    With `model.start` it begins there, and one round with little blur, Search((1.0,)), is enough after a window like this one.
     A round begins where the last one ended: the best of the starts after the first, and before the last one both
     decompositions of a free plane.  What is not sharper than no motion is searched for again from there.
     """
@@ -91,13 +99,15 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
     found = best_of(round_of(look, model, view, with_twin(model, look, x), search.stop), len(window))
     worse = (~(found.value <= -zero.log())).nonzero()[:, 0]
     if len(worse):
-        part = replace(model, normal=None if model.normal is None else model.normal[worse])
+        part = replace(model, start=None, normal=None if model.normal is None else model.normal[worse])
         found = _mended(found, worse, round_of(look, part, view[worse], torch.zeros_like(x[worse]), search.stop))
     return _report(window, model, look, view, [*rounds, found], zero)
 
 
 def starts(window: Window, model: Model, far: float) -> Tensor:
-    """Where each window's search begins: at rest, and with a displacement to four sides: -> [B * S, P] px, float64."""
+    """Where searches begin: at the model's start, else at rest and displaced to four sides: -> [B * S, P] px, float64."""
+    if model.start is not None:
+        return model.start.to(window.ray.device, torch.float64)
     sides = [[0, 0, 0], [far, 0, 0], [-far, 0, 0], [0, far, 0], [0, -far, 0]] if far > 0 else [[0, 0, 0]]
     x = torch.zeros(len(sides), model.size, dtype=torch.float64, device=window.ray.device)
     x[:, :3] = x.new_tensor(sides)  # of a turn or of a shift, whichever the model has first: both move the image

@@ -19,8 +19,8 @@ The value may be less precise than x; how precise its type is decides which diff
 class Stop:
     """When a row is done, and how far it may step.  px are lengths in the metric of `minimize`."""
 
-    tolerance: float = 0.005
-    """px: a row is done when its full step would be shorter."""
+    tolerance: float = 0.01
+    """px: a row is done when its full step is shorter; that step is taken without another evaluation."""
     iterations: int = 40
     """Accepted steps at most."""
     trials: int = 12
@@ -106,6 +106,7 @@ class _Rows:
     def judge(self, good: Tensor, stuck: Tensor) -> None:
         """Which rows are done: the full step is shorter than the tolerance, or nothing can be done where they are stuck."""
         small = good & self.scaled & (self.length * self.norm < self.stop.tolerance)
+        self.x = torch.where(small[:, None], self.x + self.length[:, None] * self.step, self.x)  # as good as sure, and not evaluated
         self.converged = self.converged | small | (stuck & ~self.done)
         spent = (self.iterations >= self.stop.iterations) | (self.trials >= self.stop.trials)
         self.done = self.done | self.converged | spent

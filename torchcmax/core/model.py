@@ -59,10 +59,12 @@ class Model(ABC):
     """Parameters x [A, P] in pixels of displacement over the window; row i belongs to window owner[i].
 
     focal px | normal [W, 3]: the known plane of every window in the frame of its first event, None where it isn't known
+    start [W, P] px: where each window's search begins, as after the window before; None: at rest
     """
 
     focal: float
     normal: Tensor | None = None
+    start: Tensor | None = None
     size: ClassVar[int] = 0
     free_plane: ClassVar[bool] = False
     """Whether the plane is among the parameters, so that it has a twin."""

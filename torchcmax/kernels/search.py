@@ -357,6 +357,8 @@ def search(x, look, scene, stop, terms):
             step, limit, length = aimed(inverse, gradient, G, scaled, stop)
             trace[evaluations - 1] = value
             converged = scaled and length * length_in(step, G) < stop.tolerance
+            if converged:  # the last step is as good as sure, and not evaluated
+                x = x + length * step
         else:
             low, high, trials = (low, length, trials + 1) if too_long else (length, high, trials + 1)
             length = narrowed(length, low, high, limit, guess)
