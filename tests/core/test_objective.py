@@ -5,6 +5,7 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.contrast import CONTRASTS
 from torchcmax.core.model import Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import REFERENCES, RIDGE, ContrastName, Look, deformation, metric, objective, penalty
+from torchcmax.core.warp import monomials
 from torchcmax.core.window import Window
 
 CANVAS = Canvas(30.0, (23.3, 17.7), (36, 48))
@@ -114,7 +115,7 @@ def test_the_metric_measures_how_far_a_step_moves_the_events(window, kind):
     G = metric(look, model, ink, x, owner)
     ridge = RIDGE * G.diagonal(dim1=1, dim2=2).mean(-1)[:, None, None] / (1 + RIDGE) * torch.eye(kind.size)
     step = 1e-3 * torch.arange(1, kind.size + 1, dtype=torch.float64).expand(2, -1)
-    basis = ink.basis
+    basis = monomials(ink.ray.mT, ink.s)
 
     def place(x):
         ray = model.homography(x, owner, 0.5).transpose(1, 2).flatten(2) @ basis

@@ -51,7 +51,8 @@ def homographies(random, rows=5):
 
 
 def framed_twin(H_k, ink, canvas, owner):
-    return _framed(vote_scatter, H_k, ink.basis[owner], ink.weight[owner], canvas)
+    basis, weight = ink.aligned
+    return _framed(vote_scatter, H_k, basis[owner], weight[owner], canvas)
 
 
 def agree(H_k, ink, canvas, owner, tolerance):
@@ -157,7 +158,7 @@ def frame_of(random, height=20, width=30):
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 1.0, 2.0, 4.0, 9.0])
 def test_the_blur_is_the_twin(sigma, random):
     frame, result, taps = frame_of(random), np.zeros((22, 32)), image.taps(sigma)
-    image.blur(frame, taps, np.zeros(32 + 2 * len(taps)), result)
+    image.blur(frame, taps, np.zeros(32 + 2 * len(taps)), result, (0, 22))
     plain = torch.from_numpy(frame[1:-1, 1:-1])[None]
     twin = _smooth(_smooth(plain, sigma, -2), sigma, -1) if sigma else plain
     np.testing.assert_allclose(result[1:-1, 1:-1], twin[0], rtol=1e-12, atol=1e-14)

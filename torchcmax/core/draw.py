@@ -34,12 +34,8 @@ class Ink:
     @classmethod
     def of(cls, window: Window, weight: Tensor, reference: float = 0.5) -> Ink:
         """weight [W, N] that events vote with | reference: the time warped to, 0 the window's first event, 1 its last."""
-        return cls(window.ray[..., 0], window.ray[..., 1], window.phase - reference, weight)._aligned()
-
-    def _aligned(self) -> Ink:
-        spare = (0, -self.weight.shape[-1] % ALIGNED)
-        parts = (getattr(self, f.name) for f in fields(self))
-        return Ink(*(pad(part, spare) if spare[1] else part.contiguous() for part in parts))
+        parts = window.ray[..., 0], window.ray[..., 1], window.phase - reference, weight
+        return cls(*(part.contiguous() for part in parts))
 
     def __getitem__(self, index: slice | Tensor) -> Ink:
         """Some of the windows."""
@@ -47,7 +43,7 @@ class Ink:
 
     def thinned(self, step: int) -> Ink:
         """Every step-th event of each window."""
-        return Ink(*(getattr(self, f.name)[:, ::step] for f in fields(self)))._aligned() if step > 1 else self
+        return Ink(*(getattr(self, f.name)[:, ::step].contiguous() for f in fields(self))) if step > 1 else self
 
     def sample(self, count: int) -> Ink:
         """`count` events of each window, evenly from its first to its last; repeated where a window has fewer."""
@@ -61,14 +57,16 @@ class Ink:
         return torch.stack([self.x, self.y, torch.ones_like(self.x)], 1)
 
     @cached_property
-    def basis(self) -> Tensor:
-        """[W, 3K, N] of `monomials`, for the plain torch path."""
-        return monomials(self.ray.mT, self.s, TERMS)
+    def aligned(self) -> tuple[Tensor, Tensor]:
+        """For the plain torch path: basis [W, 3K, N] of `monomials` and weight [W, N], padded to a multiple of ALIGNED."""
+        spare = (0, -self.weight.shape[-1] % ALIGNED)
+        return monomials(pad(self.ray, spare).mT, pad(self.s, spare), TERMS), pad(self.weight, spare)
 
 
 def draw_twin(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
     """The readable twin of `draw`, in plain torch operations."""
-    return canvas.folded(_framed(vote_scatter, H_k, ink.basis[owner], ink.weight[owner], canvas))
+    basis, weight = ink.aligned
+    return canvas.folded(_framed(vote_scatter, H_k, basis[owner], weight[owner], canvas))
 
 
 def draw(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
@@ -82,9 +80,10 @@ def draw(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
         return draw_twin(H_k, ink, canvas, owner)
     if kernels.drawing(ink.x) is not None:
         return canvas.folded(_Kernel.apply(H_k, ink, canvas, owner))
-    rows = [(H_k, ink.basis[owner], ink.weight[owner])]
+    basis, weight = ink.aligned
+    rows = [(H_k, basis[owner], weight[owner])]
     if not ink.x.is_cuda:
-        rows = [(H_k[i : i + 1].clone(), ink.basis[w : w + 1], ink.weight[w : w + 1]) for i, w in enumerate(owner.tolist())]
+        rows = [(H_k[i : i + 1].clone(), basis[w : w + 1], weight[w : w + 1]) for i, w in enumerate(owner.tolist())]
     return canvas.folded(torch.cat([_framed(vote, *row, canvas) for row in rows]))
 
 

@@ -16,7 +16,7 @@ from torchcmax.core.contrast import CONTRASTS, blur, normalized
 from torchcmax.core.draw import Ink, draw
 from torchcmax.core.minimize import Minimum, Objective, Stop, minimize
 from torchcmax.core.model import CLOSEST, Displacement, Model, Planar, PlanarKnown, Rotation, Translation
-from torchcmax.core.warp import TERMS
+from torchcmax.core.warp import TERMS, monomials
 from torchcmax.core.window import Window
 
 REFERENCES = {"first": 0.0, "middle": 0.5}
@@ -156,7 +156,8 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
     nearby = torch.cat([x[:, None] + steps, x[:, None] - steps], 1).flatten(0, 1)  # central differences of one pixel
     each = owner.repeat_interleave(2 * parameters)
     flat = model.homography(nearby, each, REFERENCES[look.reference]).transpose(1, 2).flatten(2)
-    ray = (flat[..., None] * some.basis[each][:, None].to(x)).sum(2)  # no matrix products here, which round differently in another batch
+    basis = monomials(some.ray.mT, some.s).to(x)
+    ray = (flat[..., None] * basis[each][:, None]).sum(2)  # no matrix products here, which round differently in another batch
     flow = (ray[:, :2] / ray[:, 2:].clamp_min(NEAREST) * model.focal).view(len(x), 2, parameters, -1)
     J = (flow[:, 0] - flow[:, 1]) / 2 * (some.weight[owner] != 0).to(x)[:, None].repeat(1, 1, 2)
     G = (J[:, :, None] * J[:, None]).sum(-1) / events

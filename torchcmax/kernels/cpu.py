@@ -45,7 +45,7 @@ class Problem:
         """A window of the problem, with scratch that belongs to the thread that asks."""
         view = self.view
         rows, some, normal = _rows(view.ink), _rows(view.some), _array(self.normal.double())
-        lens, taps = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x)
+        lens, taps = lens_of(view.canvas, view.ink.x), _taps(float(view.sigma), view.ink.x.dtype)
         return lambda window: searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(view.canvas, taps))
 
 
@@ -82,7 +82,7 @@ def slopes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor, gradient: Tensor) 
 def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
     """Normalized contrast of the blurred image of warped events on a pinhole canvas: H_k [A, K, 3, 3] | owner [A] -> [A]."""
     H, rows = _array(H_k.to(view.ink.x)), _rows(view.ink)
-    lens, taps, code = lens_of(view.canvas, view.ink.x), _taps(view.sigma, view.ink.x), image.CONTRASTS.index(contrast)
+    lens, taps, code = lens_of(view.canvas, view.ink.x), _taps(float(view.sigma), view.ink.x.dtype), image.CONTRASTS.index(contrast)
     values = np.zeros(len(H))
 
     def work(a: int, window: int) -> None:
@@ -116,10 +116,16 @@ def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slic
     exact, there = searching.homography_at(x, look, scene.normal, problem.terms)
     H, totals = exact.astype(scene.lens.dtype), np.zeros((len(parts), *exact.shape))
     pieces = [tuple(array[part] for array in scene.events) for part in parts]
-    _spread(lambda i: events.draw(H, pieces[i], scene.lens, frames[i]), [(i,) for i in range(len(parts))])
+    reached: list[tuple[int, int]] = [(0, 0)] * len(parts)
+
+    def draw(i: int) -> None:
+        reached[i] = events.draw(H, pieces[i], scene.lens, frames[i])
+
+    _spread(draw, [(i,) for i in range(len(parts))])
+    band = min(first for first, _ in reached), max(last for _, last in reached)
     frames.sum(0, out=scene.frames[0].reshape(-1))
-    sharp = searching.develop(look.contrast, scene.kernel, scene.frames, scene.line)
-    searching.develop_slope(scene.kernel, scene.frames, scene.line)
+    sharp = searching.develop(look.contrast, scene.kernel, scene.frames, scene.line, band)
+    searching.develop_slope(scene.kernel, scene.frames, scene.line, band)
     flat = scene.frames[0].reshape(-1)
     _spread(lambda i: events.draw_slopes(H, pieces[i], scene.lens, flat, totals[i]), [(i,) for i in range(len(parts))])
     cost = searching.strain(there, exact, look, scene.some) + searching.lean(there, look)
@@ -154,7 +160,8 @@ def lens_of(canvas: Any, like: Tensor) -> Array:
         raise ValueError(f"a canvas of {height} x {width} px has more than 2^24 pixels, which float32 cannot count; draw in float64")
     least = torch.finfo(like.dtype).tiny ** 0.5 if canvas.sphere else kernels.NEAREST
     span = events.SPAN if like.dtype == torch.float32 else 0.0
-    return _array(like.new_tensor([canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, span]))
+    numbers = [canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, span]
+    return np.array(numbers, "f4" if like.dtype == torch.float32 else "f8")
 
 
 def _array(x: Tensor) -> Array:
@@ -167,8 +174,10 @@ def _rows(ink: Any) -> Callable[..., tuple[Array, ...]]:
     return lambda window, part=slice(None): tuple(array[window, part] for array in arrays)
 
 
-def _taps(sigma: float, like: Tensor) -> Array:
-    return _array(torch.from_numpy(image.taps(float(sigma))).to(like))
+@lru_cache(maxsize=64)
+def _taps(sigma: float, dtype: torch.dtype) -> Array:
+    taps: Array = image.taps(sigma).astype("f4" if dtype == torch.float32 else "f8")
+    return taps
 
 
 def _scratch(canvas: Any, taps: Array) -> tuple[Array, Array]:

@@ -212,13 +212,24 @@ def count(weight):
 
 
 @compiled
+def reach(pixel, least, most):
+    """The least and most of some pixels and of two more."""
+    for i in range(len(pixel)):
+        least, most = min(least, pixel[i]), max(most, pixel[i])
+    return least, most
+
+
+@compiled
 def draw(H, events, lens, frame):
-    """Warp the events of a window and vote: H [K, 3, 3] | events: x, y, s, weight [N] | frame [(H + 2) (W + 2)], added to."""
+    """Warp the events of a window and vote: H [K, 3, 3] | events: x, y, s, weight [N] | frame [(H + 2) (W + 2)], added to.
+
+    -> the first row of the frame that has votes, and the one after the last
+    """
     x, y, s, weight = events
     last, stride = count(weight), np.int64(lens[5])
     near, ray, share = np.empty((3, 3, 3), x.dtype), np.empty((3, BLOCK), x.dtype), np.empty((3, BLOCK), x.dtype)
     pixel = np.empty(BLOCK, np.int32)
-    i = 0
+    i, least, most = 0, np.int32(len(frame)), np.int32(0)
     while i < last:
         end, s_0 = block_end(s, i, last, lens[8])
         n = end - i
@@ -229,7 +240,9 @@ def draw(H, events, lens, frame):
         else:
             land(ray, weight[i:end], lens, pixel, share)
         scatter(pixel[:n], share, stride, frame)
+        least, most = reach(pixel[:n], least, most)
         i = end
+    return least // stride, most // stride + 2
 
 
 @compiled

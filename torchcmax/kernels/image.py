@@ -66,16 +66,16 @@ def shifts(line, start, length, i):
 
 
 @compiled
-def blur(frame, kernel, line, result):
+def blur(frame, kernel, line, result, wanted):
     """Smooth in both directions, row by row; nothing lies outside: line [W + 2 + 2 radius], scratch.
 
-    The border of the result is not written.
+    Of the result only the wanted rows, from the first to the one before the last, are written, and not the border.
     """
     height, width, radius = frame.shape[0], frame.shape[1], len(kernel) - 1
     start, inner = radius + 1, width - 2
     line[:] = 0
     middle = line[radius : radius + width]
-    for y in range(1, height - 1):
+    for y in range(max(wanted[0], 1), min(wanted[1], height - 1)):
         scaled(kernel[0], frame[y], middle)
         i = 1
         while i + 2 <= radius:

@@ -214,18 +214,21 @@ def homography_at(x, look, known, terms):
 
 
 @compiled
-def develop(code, kernel, frames, line):
-    """The contrast of the votes in frames[0]; its derivative to the blurred image is left in frames[2]."""
-    border(frames[0])
-    blur(frames[0], kernel, line, frames[1])
-    border(frames[1])
-    return contrast(code, frames[1], frames[2], frames[0])
+def develop(code, kernel, frames, line, rows):
+    """The contrast of the votes in these rows of frames[0]; its derivative to the blurred image is left in frames[2]."""
+    votes, blurred, radius, (first, last) = frames[0], frames[1], len(kernel) - 1, rows
+    border(votes)
+    blurred[: max(first - radius, 1)] = 0  # rows that no vote reaches: a third of them, as the canvas is wider than the sensor
+    blurred[min(last + radius, len(votes) - 1) :] = 0
+    blur(votes, kernel, line, blurred, (first - radius, last + radius))
+    border(blurred)
+    return contrast(code, blurred, frames[2], votes)
 
 
 @compiled
-def develop_slope(kernel, frames, line):
-    """The derivative of `develop` to the votes, right after it: left in frames[0]."""
-    blur(frames[2], kernel, line, frames[0])
+def develop_slope(kernel, frames, line, rows):
+    """The derivative of `develop` to the votes, right after it: left in frames[0], in these rows, which had votes."""
+    blur(frames[2], kernel, line, frames[0], rows)
     border(frames[0])
 
 
@@ -233,26 +236,27 @@ def develop_slope(kernel, frames, line):
 def sharpness(H, events, lens, kernel, code, frames, line):
     """The normalized contrast of one image."""
     frames[0] = 0
-    draw(H, events, lens, frames[0].reshape(-1))
-    return develop(code, kernel, frames, line) / energy_of(events[3], code, frames)
+    rows = draw(H, events, lens, frames[0].reshape(-1))
+    return develop(code, kernel, frames, line, rows) / energy_of(events[3], code, frames)
 
 
 @compiled
 def value_at(x, look, scene, energy, H):
-    """-log contrast + guard at x, and the contrast; H [K, 3, 3] and scene.frames are left for `slope_at`."""
+    """-log contrast + guard at x; the contrast and the rows with votes are for `slope_at`, and so are H [K, 3, 3] and scene.frames."""
     exact, there = homography_at(x, look, scene.normal, len(H))
     H[:] = exact
     scene.frames[0] = 0
-    draw(H, scene.events, scene.lens, scene.frames[0].reshape(-1))
-    sharp = develop(look.contrast, scene.kernel, scene.frames, scene.line)
-    return strain(there, exact, look, scene.some) + lean(there, look) - np.log(sharp / energy), sharp
+    rows = draw(H, scene.events, scene.lens, scene.frames[0].reshape(-1))
+    sharp = develop(look.contrast, scene.kernel, scene.frames, scene.line, rows)
+    return strain(there, exact, look, scene.some) + lean(there, look) - np.log(sharp / energy), (sharp, rows)
 
 
 @compiled
-def slope_at(x, sharp, look, scene, H):
+def slope_at(x, developed, look, scene, H):
     """The derivative of `value_at`, right after it: -> [P]."""
     to_H = np.zeros(H.shape)
-    develop_slope(scene.kernel, scene.frames, scene.line)
+    sharp, rows = developed
+    develop_slope(scene.kernel, scene.frames, scene.line, rows)
     draw_slopes(H, scene.events, scene.lens, scene.frames[0].reshape(-1), to_H)
     to_H /= -sharp
     return chained(x, to_H, look, scene.normal, scene.some)
@@ -278,8 +282,8 @@ def chained(x, to_H, look, known, some):
 def evaluate(x, look, scene, terms):
     """Value and derivative at x."""
     H = np.empty((terms, 3, 3), scene.lens.dtype)
-    value, sharp = value_at(x, look, scene, energy_of(scene.events[3], look.contrast, scene.frames), H)
-    return value, slope_at(x, sharp, look, scene, H)
+    value, developed = value_at(x, look, scene, energy_of(scene.events[3], look.contrast, scene.frames), H)
+    return value, slope_at(x, developed, look, scene, H)
 
 
 @compiled
@@ -330,8 +334,8 @@ def search(x, look, scene, stop, terms):
     inverse, eps = plain.copy(), np.finfo(scene.lens.dtype).eps
     energy = energy_of(scene.events[3], look.contrast, scene.frames)
     trace = np.empty(1 + stop.iterations * (stop.trials + 1))
-    value, sharp = value_at(x, look, scene, energy, H)
-    gradient = slope_at(x, sharp, look, scene, H)
+    value, developed = value_at(x, look, scene, energy, H)
+    gradient = slope_at(x, developed, look, scene, H)
     trace[0] = value
     iterations, trials, evaluations, scaled = 0, 0, 1, False
     converged = np.abs(gradient).max() == 0
@@ -340,13 +344,13 @@ def search(x, look, scene, stop, terms):
     low, high = 0.0, np.inf
     while not done:
         near = x + length * step
-        value_new, sharp = value_at(near, look, scene, energy, H)
+        value_new, developed = value_at(near, look, scene, energy, H)
         slope = (gradient * step).sum()
         good = value_new <= value + stop.armijo * length * slope + 4 * eps * abs(value)
         gradient_new, guess = gradient, -slope * length * length / (2 * (value_new - value - slope * length))
         too_long = not good
         if good:
-            gradient_new = slope_at(near, sharp, look, scene, H)
+            gradient_new = slope_at(near, developed, look, scene, H)
             good = not ((gradient_new * step).sum() < stop.wolfe * slope and length < limit)
         trace[evaluations] = value
         evaluations += 1
