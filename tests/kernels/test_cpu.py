@@ -10,7 +10,7 @@ import torch
 from torchcmax import kernels
 from torchcmax.core.camera import Canvas, Sphere
 from torchcmax.core.contrast import CONTRASTS, _smooth, normalized
-from torchcmax.core.draw import Ink, _framed, draw_twin
+from torchcmax.core.draw import Ink, _framed, draw, draw_twin
 from torchcmax.core.minimize import Stop, minimize
 from torchcmax.core.model import Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look, View, metric, minimum, objective, penalty, problem
@@ -120,8 +120,20 @@ def test_behind_the_camera_votes_nothing(random):
 def test_a_canvas_that_float32_cannot_count_is_refused(random):
     ink = ink_of(random)
     ink = Ink(ink.x.float(), ink.y.float(), ink.s.float(), ink.weight.float())
-    with pytest.raises(ValueError, match="5000 x 5000 px has more than"):
+    with pytest.raises(ValueError, match="5000 x 5000 px has more than 16777216"):
         cpu.votes(homographies(random)[:1].float(), ink, Canvas(60.0, (0.0, 0.0), (5000, 5000)), OWNER[:1])
+
+
+def test_what_does_not_fit_together_is_refused_before_any_memory_is_touched(random):
+    ink, H_k = ink_of(random), homographies(random)
+    with pytest.raises(ValueError, match=r"wants dL/dframe \[5, 33, 42\], got \[5, 31, 40\]"):
+        cpu.slopes(H_k, ink, CANVAS, OWNER, torch.ones(5, 31, 40).double())
+    with pytest.raises(ValueError, match=r"ink wants x, y, s and weight \[W, N\], got"):
+        Ink(ink.x, ink.y[:, 1:], ink.s, ink.weight)
+    with pytest.raises(ValueError, match=r"draw wants H_k \[A, K, 3, 3\] and owner \[A\], got \[5, 6, 3, 3\] and \[4\]"):
+        draw(H_k, ink, CANVAS, OWNER[:4])
+    with pytest.raises(IndexError):
+        cpu.votes(H_k, ink, CANVAS, OWNER + 1)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

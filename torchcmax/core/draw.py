@@ -31,6 +31,11 @@ class Ink:
     s: Tensor
     weight: Tensor
 
+    def __post_init__(self) -> None:
+        shapes = {part.shape for part in (self.x, self.y, self.s, self.weight)}
+        if len(shapes) != 1 or self.x.ndim != 2:
+            raise ValueError(f"ink wants x, y, s and weight [W, N], got {', '.join(str([*shape]) for shape in sorted(shapes))}")
+
     @classmethod
     def of(cls, window: Window, weight: Tensor, reference: float = 0.5) -> Ink:
         """weight [W, N] that events vote with | reference: the time warped to, 0 the window's first event, 1 its last."""
@@ -76,6 +81,8 @@ def draw(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
 
     Differentiable to H_k, once. On the CPU each row is computed by itself, in the cache and the same in any batch.
     """
+    if H_k.ndim != 4 or H_k.shape[2:] != (3, 3) or owner.shape != H_k.shape[:1]:
+        raise ValueError(f"draw wants H_k [A, K, 3, 3] and owner [A], got {[*H_k.shape]} and {[*owner.shape]}")
     if ink.x.is_cuda and torch.are_deterministic_algorithms_enabled():
         return draw_twin(H_k, ink, canvas, owner)
     if kernels.drawing(ink.x) is not None:

@@ -23,7 +23,7 @@ from torchcmax.kernels.search import Look
 
 forget_stale()
 Array = np.ndarray[Any, np.dtype[Any]]
-MOST = 1 << 24  # pixels that float32 tells apart
+MOST = {torch.float32: 1 << 24, torch.float64: 1 << 31}  # pixels of a frame: what float32 tells apart, what an int32 counts
 PART = 50_000  # events for which a second thread pays, where there is one window
 _own = threading.local()
 
@@ -70,7 +70,10 @@ def slopes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor, gradient: Tensor) 
     """The derivative of `votes`: gradient = dL/dframe [A, H + 2, W + 2] -> dL/dH_k [A, K, 3, 3]."""
     H, rows, lens = _array(H_k.to(ink.x)), _rows(ink), lens_of(canvas, ink.x)
     parts = _parts(len(H), ink.x.shape[-1])
-    frames, totals = _array(gradient).reshape(len(H), -1), np.zeros((len(parts), *H.shape))
+    shape = (len(H), canvas.size[0] + 2, canvas.size[1] + 2)
+    if gradient.shape != shape:
+        raise ValueError(f"slopes wants dL/dframe {[*shape]}, got {[*gradient.shape]}")
+    frames, totals = _array(gradient.to(ink.x)).reshape(len(H), -1), np.zeros((len(parts), *H.shape))
 
     def work(a: int, window: int, i: int) -> None:
         events.draw_slopes(H[a], rows(window, parts[i]), lens, frames[a], totals[i, a])
@@ -156,8 +159,8 @@ def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor
 def lens_of(canvas: Any, like: Tensor) -> Array:
     """How rays meet the frame, in the numbers that kernels/events.py wants."""
     (height, width), (x, y) = canvas.size, canvas.centre
-    if like.dtype == torch.float32 and (height + 2) * (width + 2) > MOST:
-        raise ValueError(f"a canvas of {height} x {width} px has more than 2^24 pixels, which float32 cannot count; draw in float64")
+    if (height + 2) * (width + 2) >= MOST[like.dtype]:
+        raise ValueError(f"a canvas of {height} x {width} px has more than {MOST[like.dtype]} pixels, the most that {like.dtype} can draw")
     least = torch.finfo(like.dtype).tiny ** 0.5 if canvas.sphere else kernels.NEAREST
     span = events.SPAN if like.dtype == torch.float32 else 0.0
     numbers = [canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, span]
