@@ -35,6 +35,15 @@ def rand(device, dtype):
     return lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64).to(device, dtype)
 
 
+@pytest.fixture(autouse=True)
+def threads():
+    """One, also after a test that ran the command line, which takes all."""
+    from torchcmax import kernels
+
+    yield
+    kernels.set_threads(0)
+
+
 @pytest.fixture(scope="session")
 def shared():
     """The folder of recordings and judges beside the checkout."""

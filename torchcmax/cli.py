@@ -148,7 +148,7 @@ def run_compensate(config: Namespace) -> int:
         raise UsageError(f"--images wants a number of at least 0, got {config.images}")
     if config.threads < 0:
         raise UsageError(f"--threads wants a number of at least 0, got {config.threads}")
-    kernels.set_threads(config.threads or available_cores())
+    kernels.set_threads(config.threads or available_cores())  # of this process, which is ours
     recording = open(config.recording, _opening(config))
     load_kernels(options.device)
     settings = {name: config[name] for name in ("strict", "camera", "sensor", "images")} | dataclasses.asdict(options)

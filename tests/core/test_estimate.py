@@ -8,7 +8,9 @@ import torch
 from accuracy import FAST, ROTATIONS, end_point_error, from_random_starts, sample, whole
 
 from torchcmax import kernels
+from torchcmax.core.camera import Canvas
 from torchcmax.core.estimate import Search, estimate
+from torchcmax.core.minimize import Stop
 from torchcmax.core.model import MODELS, Planar, PlanarKnown, Rotation, Translation
 from torchcmax.core.objective import Look
 from torchcmax.core.window import Window
@@ -250,3 +252,16 @@ def test_what_is_not_sharper_than_rest_is_searched_for_again_from_there(built_in
     found = estimate(window, camera, replace(model, start=lost), None, Search((1.0,)))
     assert (found.gain > 1).all()
     assert found.evaluations[2] > found.evaluations[0]
+
+
+def test_a_start_of_another_shape_is_refused(built_in):
+    camera, window = built_in
+    with pytest.raises(ValueError, match=r"a start wants \[W, P\] = \[4, 8\], got \[4, 6\]"):
+        estimate(window, camera, Planar(camera.fx, start=torch.zeros(4, 6)))
+
+
+def test_the_contrast_is_that_of_the_warp(built_in):
+    camera, window = built_in
+    found = estimate(window, camera, Rotation(camera.fx), None, Search(stop=Stop(tolerance=3.0)))
+    view = Look().at(window, Canvas.around(camera), 1.0)
+    torch.testing.assert_close(found.contrast, Look().sharpness(found.H_k, view, torch.arange(4)), rtol=1e-6, atol=0)

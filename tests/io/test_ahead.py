@@ -225,3 +225,30 @@ def test_ctrl_c_while_waiting_for_the_reader_ends_the_process_and_closes_the_sou
             print("interrupted")
     """
     assert run(code) == (0, "0\nclosed\ninterrupted\n", "")
+
+
+def test_the_source_is_closed_and_its_error_told_also_where_warnings_are_errors():
+    closed, told = [], threading.Event()
+
+    def source(fails):
+        try:
+            yield 1
+            tell(DataWarning("something"))
+            told.set()
+            if fails:
+                raise DataError("file", "is broken", "mend it")
+            yield 2
+        finally:
+            closed.append(True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(DataError, match="is broken"):
+            list(ahead(source(True)))
+        told.clear()
+        reading = ahead(source(False))
+        assert next(reading) == 1
+        assert told.wait(10)
+        with pytest.raises(DataWarning):
+            reading.close()
+    assert closed == [True, True]

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchcmax import kernels
+from torchcmax.core.camera import Canvas
 
 ROOT = Path(__file__).parents[2]
 ESTIMATE = """
@@ -54,7 +55,7 @@ def test_without_numba_everything_works_and_the_log_says_once_how_to_get_it():
 def test_the_switch_leaves_the_kernels_out(monkeypatch):
     monkeypatch.setenv(kernels.SWITCH, "0")
     assert kernels.drawing(torch.zeros(1)) is None
-    assert kernels.searching(torch.zeros(1)) is None
+    assert kernels.searching(torch.zeros(1), Canvas(1.0, (0.0, 0.0), (8, 8))) is None
 
 
 def test_other_types_of_numbers_take_the_torch_path():
@@ -101,6 +102,14 @@ def test_machine_code_older_than_its_source_is_forgotten(tmp_path):
         path.write_text("")
     os.utime(old, (1, 1))
     os.utime(tmp_path / "source.py", (2, 2))
-    compiling.forget_stale(tmp_path)
+    compiling.forget_stale(tmp_path / "__pycache__", tmp_path)
     assert new.exists()
     assert not old.exists()
+
+
+def test_a_numba_that_cannot_be_imported_is_said_once_and_done_without(tmp_path):
+    (tmp_path / "numba").mkdir()
+    (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('Numba needs another numpy')")
+    out, err = run(ESTIMATE, PYTHONPATH=str(tmp_path))
+    assert float(out) > 1.5
+    assert err.count("Numba needs another numpy") == 1

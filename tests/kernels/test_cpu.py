@@ -2,6 +2,7 @@
 
 import math
 import multiprocessing
+import time
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from torchcmax.core.warp import polynomial
 from torchcmax.core.window import Window
 
 numba = pytest.importorskip("numba", reason="numba is not installed")
-from torchcmax.kernels import cpu, events, image, search  # noqa: E402
+from torchcmax.kernels import cpu, events, image, motion  # noqa: E402
 
 CANVASES = pytest.mark.parametrize("canvas", [Canvas(60.0, (20.3, 15.7), (31, 40)), Sphere(32)], ids=["pinhole", "sphere"])
 TOLERANCE = {torch.float32: {"rtol": 2e-4, "atol": 2e-4}, torch.float64: {"rtol": 1e-9, "atol": 1e-9}}
@@ -238,14 +239,14 @@ def test_motion_homography_guard_and_metric_are_the_twins(kind, reference, scene
         for row in range(2):
             there, H = np.empty((3, 3)), np.empty((6, 3, 3))
             some = tuple(getattr(view.some, n)[row].numpy() for n in ("x", "y", "s", "weight"))
-            search.motion(x[row].numpy(), numbers, wall[row].numpy(), there)
-            search.homography(there, H)
+            motion.motion(x[row].numpy(), numbers, wall[row].numpy(), there)
+            motion.homography(there, H)
             np.testing.assert_allclose(there[0], there_twin.turn[row], atol=1e-14)
             np.testing.assert_allclose(H, H_twin[row], rtol=1e-10, atol=1e-12)
-            assert search.strain(there, H, numbers, some) + search.lean(there, numbers) == pytest.approx(
+            assert motion.strain(there, H, numbers, some) + motion.lean(there, numbers) == pytest.approx(
                 cost_twin[row].item(), rel=1e-9, abs=1e-12
             )
-            G = search.metric(x[row].numpy(), numbers, search.Scene((), some, wall[row].numpy(), *([None] * 4)), 6)
+            G = motion.metric(x[row].numpy(), numbers, wall[row].numpy(), some, 6)
             np.testing.assert_allclose(G, G_twin[row], rtol=1e-8, atol=1e-10)
 
 
@@ -312,9 +313,14 @@ def test_ten_thousand_times_the_same_without_growing(random):
     """The soak of the issue: memory is measured after a first thousand, which fill the allocator's pools."""
     ink, H_k, owner = ink_of(random, count=200), homographies(random, 1), torch.zeros(1, dtype=torch.int64)
     view, back = View(ink, CANVAS, 1.0, ink.sample(50)), random(1, 33, 42)
+    look, model, x = Look(), Rotation(60.0), torch.ones(1, 3, dtype=torch.float64)
+    find = minimum(look, model, view, owner)
 
     def once():
-        return cpu.votes(H_k, ink, CANVAS, owner), cpu.slopes(H_k, ink, CANVAS, owner, back), cpu.sharpness(H_k, view, owner, "variance")
+        value, gradient = objective(look, model, view, owner)(x, owner)
+        found = find(x, Stop(iterations=2)).x
+        drawn = cpu.votes(H_k, ink, CANVAS, owner), cpu.slopes(H_k, ink, CANVAS, owner, back)
+        return *drawn, cpu.sharpness(H_k, view, owner, "variance"), value, gradient, found
 
     first = once()
     before = 0
@@ -361,3 +367,59 @@ def test_draw_twin_and_normalized_are_what_sharpness_means(scene, random):
     view = View(ink, canvas, 0.0, ink.sample(50))
     for name, contrast in CONTRASTS.items():
         torch.testing.assert_close(cpu.sharpness(H_k, view, owner, name), contrast(image_twin), rtol=1e-10, atol=0)
+
+
+def test_ctrl_c_stops_all_threads_and_stays_ctrl_c():
+    """numba tells an interrupt within compiled code as a SystemError caused by it."""
+    done = []
+
+    def work(i):
+        done.append(i)
+        if i == 0:
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    kernels.set_threads(2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            cpu._spread(lambda i: work(i) if i == 0 else time.sleep(0.005), [(i,) for i in range(1000)])
+    finally:
+        kernels.set_threads(0)
+    assert done == [0]
+
+
+def test_scratch_is_not_taken_for_larger_than_it_is_after_memory_ran_out(monkeypatch):
+    small, large, taps = Canvas(60.0, (20.0, 15.0), (30, 40)), Canvas(60.0, (20.0, 15.0), (90, 120)), image.taps(1.0)
+    cpu._scratch(small, taps)
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "zeros", lambda *shape: (_ for _ in ()).throw(MemoryError()))
+        with pytest.raises(MemoryError):
+            cpu._scratch(large, taps)
+    assert cpu._scratch(large, taps)[0].shape == (3, 92, 122)
+
+
+def test_the_trace_has_room_for_every_evaluation(scene):
+    """Where the curvature is forgotten an iteration takes more trials than its limit; whole numbers do for the options."""
+    window, canvas = scene
+    view = Look().at(window, canvas, 1.0)
+    for stop in (Stop(tolerance=3, iterations=40, trials=3), Stop(tolerance=1e-7, iterations=10**10, trials=12, longest=6)):
+        found = minimum(Look(guard=10), Rotation(60), view, torch.arange(2))(torch.zeros(2, 3).double(), stop)
+        assert (found.trace.isfinite().sum(1) == found.evaluations).all()
+        assert (found.trace.diff(dim=1).nan_to_num(0) <= 1e-12).all()
+
+
+def test_what_is_the_users_own_is_left_to_torch(scene, monkeypatch):
+    window, canvas = scene
+
+    class Sharper(Look):
+        pass
+
+    monkeypatch.setitem(CONTRASTS, "own", CONTRASTS["variance"])
+    view = Look().at(window, canvas, 1.0)
+    own = Look()
+    object.__setattr__(own, "contrast", "own")
+    assert problem(Look(), Rotation(60.0), view) is not None
+    assert problem(Sharper(), Rotation(60.0), view) is None
+    assert problem(own, Rotation(60.0), view) is None
+    assert problem(Look(), Rotation(60.0), View(view.ink, Sphere(32), 1.0, view.some)) is None
+    H_k = Rotation(60.0).homography(torch.zeros(2, 3).double(), torch.arange(2), 0.5)
+    torch.testing.assert_close(own.sharpness(H_k, view, torch.arange(2)), Look().sharpness(H_k, view, torch.arange(2)), rtol=1e-9, atol=0)

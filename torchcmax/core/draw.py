@@ -85,7 +85,7 @@ def draw(H_k: Tensor, ink: Ink, canvas: Screen, owner: Tensor) -> Tensor:
         raise ValueError(f"draw wants H_k [A, K, 3, 3] and owner [A], got {[*H_k.shape]} and {[*owner.shape]}")
     if ink.x.is_cuda and torch.are_deterministic_algorithms_enabled():
         return draw_twin(H_k, ink, canvas, owner)
-    if kernels.drawing(ink.x) is not None:
+    if kernels.drawing(ink.x, kernels.frame(canvas)) is not None:
         return canvas.folded(_Kernel.apply(H_k, ink, canvas, owner))
     basis, weight = ink.aligned
     rows = [(H_k, basis[owner], weight[owner])]

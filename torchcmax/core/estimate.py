@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.minimize import Minimum, Stop
 from torchcmax.core.model import Displacement, Model
-from torchcmax.core.objective import REFERENCES, Look, View, minimum, penalty
+from torchcmax.core.objective import REFERENCES, Look, View, minimum
 from torchcmax.core.pose import Motion
 from torchcmax.core.warp import TERMS, still
 from torchcmax.core.window import Window
@@ -107,6 +107,8 @@ def estimate(window: Window, camera: Camera, model: Model, look: Look | None = N
 def starts(window: Window, model: Model, far: float) -> Tensor:
     """Where searches begin: at the model's start, else at rest and displaced to four sides: -> [B * S, P] px, float64."""
     if model.start is not None:
+        if model.start.shape != (len(window), model.size):
+            raise ValueError(f"a start wants [W, P] = {[len(window), model.size]}, got {[*model.start.shape]}")
         return model.start.to(window.ray.device, torch.float64)
     sides = [[0, 0, 0], [far, 0, 0], [-far, 0, 0], [0, far, 0], [0, -far, 0]] if far > 0 else [[0, 0, 0]]
     x = torch.zeros(len(sides), model.size, dtype=torch.float64, device=window.ray.device)
@@ -161,16 +163,14 @@ def _report(window: Window, model: Model, look: Look, view: View, rounds: list[M
     found, seen = rounds[-1], window.duration > 0  # events that come all at once show no motion
     owner, reference = torch.arange(len(window), device=zero.device), REFERENCES[look.reference]
     x = torch.where(seen[:, None], found.x, 0.0)
-    there = model.at_reference(x, owner, reference)
-    H_k = there.homography()
-    cost = penalty(look, model, there, H_k, view.some.ray.to(x))
+    H_k = model.homography(x, owner, reference).to(zero)
     displacement = model.displacement(x, owner)
     return Estimate(
         motion=rates(displacement, window),
         normal=displacement.normal.to(zero) if model.has_plane else None,
-        H_k=H_k.to(zero),
+        H_k=H_k,
         contrast_zero=zero,
-        contrast=torch.where(seen, (cost - found.value).exp().to(zero), zero),
+        contrast=look.sharpness(H_k, view, owner),
         iterations=torch.stack([r.iterations for r in rounds]).sum(0),
         evaluations=torch.stack([r.evaluations for r in rounds]).sum(0),
         converged=found.converged & seen,

@@ -41,6 +41,7 @@ class Stop:
 class Minimum:
     """Where each row ended: x [B, P] | value [B] | iterations, evaluations [B] int | converged [B] bool | trace [B, T].
 
+    A converged row's last step is not evaluated: its value is that of the point before.
     trace holds the lowest value after each evaluation, nan after the row's own last one.
     """
 

@@ -59,8 +59,8 @@ class Look:
 
     def sharpness(self, H_k: Tensor, view: View, owner: Tensor) -> Tensor:
         """Normalized contrast of the image of warped events: H_k [A, K, 3, 3] | owner [A] -> [A]."""
-        kernel = kernels.searching(view.ink.x)
-        if kernel is not None and not H_k.requires_grad:
+        kernel = kernels.searching(view.ink.x, view.canvas)
+        if kernel is not None and not H_k.requires_grad and self.contrast in kernel.CONTRASTS:
             values: Tensor = kernel.sharpness(H_k, view, owner, self.contrast)
             return values
         image = normalized(draw(H_k, view.ink, view.canvas, owner), view.ink.weight[owner])
@@ -127,7 +127,7 @@ def objective(look: Look, model: Model, view: View, owner: Tensor) -> Objective:
 
     Parameters are meant to be float64, whatever the images are: twelve numbers cost nothing, and the search is that of the kernels.
     """
-    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x)
+    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x, view.canvas)
     if numbers is not None and kernel is not None:
         return lambda x, rows: kernel.evaluate(numbers, x, owner[rows])
     ray = view.some.ray.double()
@@ -169,13 +169,13 @@ IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order o
 
 
 def problem(look: Look, model: Model, view: View) -> Any:
-    """What the kernels of this device want for the same objective; None where there is no kernel, or the model is someone's own."""
-    kernel = kernels.searching(view.ink.x)
-    if kernel is None or type(model) not in IN_MACHINE_CODE:
+    """What the kernels of this device want for the same objective; None where there is no kernel, or something is someone's own."""
+    kernel = kernels.searching(view.ink.x, view.canvas)
+    if kernel is None or type(model) not in IN_MACHINE_CODE or type(look) is not Look or look.contrast not in kernel.CONTRASTS:
         return None
     sought = kernel.Look(
-        model=IN_MACHINE_CODE.index(type(model)), focal=model.focal, reference=REFERENCES[look.reference],
-        contrast=list(CONTRASTS).index(look.contrast), deformation=look.deformation, guard=look.guard, tilt=look.tilt,
+        model=IN_MACHINE_CODE.index(type(model)), focal=float(model.focal), reference=REFERENCES[look.reference],
+        contrast=kernel.CONTRASTS.index(look.contrast), deformation=float(look.deformation), guard=float(look.guard), tilt=float(look.tilt),
         closest=CLOSEST, grazing=GRAZING, nearest=NEAREST, ridge=RIDGE,
     )  # fmt: skip
     known = model.wall(view.ink.x, torch.arange(len(view.ink.x)))
@@ -184,7 +184,7 @@ def problem(look: Look, model: Model, view: View) -> Any:
 
 def minimum(look: Look, model: Model, view: View, owner: Tensor) -> Callable[[Tensor, Stop | None], Minimum]:
     """The way to the minimum of `objective` from x [B, P], measured by `metric`: in machine code where there is some for it."""
-    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x)
+    numbers, kernel = problem(look, model, view), kernels.searching(view.ink.x, view.canvas)
     if numbers is None or kernel is None:
         return lambda x, stop: minimize(objective(look, model, view, owner), x, metric(look, model, view.some, x, owner), stop)
     return lambda x, stop: Minimum(*kernel.search(numbers, x, owner, stop or Stop()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import TypeVar
 
 from torchcmax.io.errors import LATER
@@ -24,18 +25,20 @@ def ahead(source: Generator[T, None, None]) -> Generator[T, None, None]:
     try:
         coming = reader.submit(next, source, end)
         while True:
-            try:
-                thing = coming.result()
-            finally:
-                _tell_again(told)
+            thing = coming.result()
+            _tell_again(told)
             if thing is end:
                 return
             coming = reader.submit(next, source, end)
             yield thing  # type: ignore[misc]
+    except Exception:
+        with suppress(Warning):  # one that is made an error does not take the place of what went wrong
+            _tell_again(told)
+        raise
     finally:
         reader.shutdown(cancel_futures=True)
-        _tell_again(told)
         source.close()
+        _tell_again(told)
 
 
 def _tell_again(told: list[Warning]) -> None:

@@ -51,17 +51,25 @@ class Recording:
 
     def _blocks(self, events: int, stride: int, batch: int) -> Iterator[Events]:
         """The events of `batch` windows at a time, [batch, events]; fewer windows only at the end."""
-        kept, skip, seen, found = Events(*(np.empty(0, dtype) for dtype in ("i8", "u2", "u2", "u1"))), 0, 0, False
-        span = events + (batch - 1) * stride
+        parts: list[Events] = []
+        waiting = skip = seen = 0
+        span, found = events + (batch - 1) * stride, False
         for chunk in self.chunks():
             seen += len(chunk)
-            kept = Events.join([kept, chunk[skip:]]) if len(chunk) > skip else kept
+            if len(chunk) > skip:
+                parts.append(chunk[skip:])
+                waiting += len(parts[-1])
             skip = max(skip - len(chunk), 0)
+            if waiting < span:
+                continue
+            kept = Events.join(parts)
             while len(kept) >= span:
                 yield kept[:span].strided(events, stride)
                 found = True
                 skip = max(batch * stride - len(kept), 0)  # a stride beyond the window leaves events out
                 kept = kept[batch * stride :]
+            parts, waiting = [kept], len(kept)
+        kept = Events.join(parts) if parts else Events(*(np.empty(0, dtype) for dtype in ("i8", "u2", "u2", "u1")))
         if len(kept) >= events:
             yield kept.strided(events, stride)
         elif not found:

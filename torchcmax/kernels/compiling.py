@@ -25,13 +25,13 @@ def compiled(function: Callable[..., Any]) -> Any:
         return numba.njit(**options)(function)
 
 
-def forget_stale(sources: Path = Path(__file__).parent) -> None:
-    """Drop kept code that is older than any of the sources: numba looks at the file of the outermost function alone."""
-    newest = max(path.stat().st_mtime for path in sources.glob("*.py"))
-    for kept in sources.glob("__pycache__/*.nbi"):
-        with suppress(FileNotFoundError):  # another process does the same
-            if kept.stat().st_mtime < newest:
-                kept.unlink()
+def forget_stale(kept: Path, sources: Path = Path(__file__).parent) -> None:
+    """Drop code in `kept` that is older than any of the sources: numba looks at the file of the outermost function alone."""
+    with suppress(OSError):  # another process does the same, or the folder is not ours
+        newest = max((path.stat().st_mtime for path in sources.glob("*.py")), default=0.0)
+        for code in kept.glob("*.nbi"):
+            if code.stat().st_mtime < newest:
+                code.unlink()
 
 
 class _Say(event.Listener):

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,15 @@ from torchcmax import kernels
 from torchcmax.kernels import events, image
 from torchcmax.kernels import search as searching
 from torchcmax.kernels.compiling import forget_stale
-from torchcmax.kernels.search import Look
+from torchcmax.kernels.image import CONTRASTS
+from torchcmax.kernels.motion import Look, chained, homography_at, lean, strain
 
-forget_stale()
+if events.draw.stats.cache_path:
+    forget_stale(Path(events.draw.stats.cache_path))
 Array = np.ndarray[Any, np.dtype[Any]]
-MOST = {torch.float32: 1 << 24, torch.float64: 1 << 31}  # pixels of a frame: what float32 tells apart, what an int32 counts
 PART = 50_000  # events for which a second thread pays, where there is one window
 _own = threading.local()
+__all__ = ["CONTRASTS", "Look", "Problem", "evaluate", "search", "sharpness", "slopes", "votes"]
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,13 @@ class Problem:
     @cached_property
     def scene(self) -> Callable[[int], searching.Scene]:
         """A window of the problem, with scratch that belongs to the thread that asks."""
-        view = self.view
-        rows, some, normal = _rows(view.ink), _rows(view.some), _array(self.normal.double())
-        lens, taps = lens_of(view.canvas, view.ink.x), _taps(float(view.sigma), view.ink.x.dtype)
-        return lambda window: searching.Scene(rows(window), some(window), normal[window], lens, taps, *_scratch(view.canvas, taps))
+        return _scenes(self.view, self.normal)
+
+
+def _scenes(view: Any, normal: Tensor) -> Callable[[int], searching.Scene]:
+    rows, some, known = _rows(view.ink), _rows(view.some), _array(normal.double())
+    lens, taps = lens_of(view.canvas, view.ink.x), _taps(float(view.sigma), view.ink.x.dtype)
+    return lambda window: searching.Scene(rows(window), some(window), known[window], lens, taps, *_scratch(view.canvas, taps))
 
 
 def votes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor) -> Tensor:
@@ -84,12 +90,11 @@ def slopes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor, gradient: Tensor) 
 
 def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
     """Normalized contrast of the blurred image of warped events on a pinhole canvas: H_k [A, K, 3, 3] | owner [A] -> [A]."""
-    H, rows = _array(H_k.to(view.ink.x)), _rows(view.ink)
-    lens, taps, code = lens_of(view.canvas, view.ink.x), _taps(float(view.sigma), view.ink.x.dtype), image.CONTRASTS.index(contrast)
+    H, code, scene_of = _array(H_k.to(view.ink.x)), image.CONTRASTS.index(contrast), _scenes(view, view.ink.x.new_zeros(len(view.ink.x), 3))
     values = np.zeros(len(H))
 
     def work(a: int, window: int) -> None:
-        values[a] = searching.sharpness(H[a], rows(window), lens, taps, code, *_scratch(view.canvas, taps))
+        values[a] = searching.sharpness(H[a], code, scene_of(window))
 
     _spread(work, list(enumerate(owner.tolist())))
     return torch.from_numpy(values).to(H_k)
@@ -110,13 +115,13 @@ def evaluate(problem: Problem, x: Tensor, owner: Tensor) -> tuple[Tensor, Tensor
     else:
         for row, window in tasks:
             values[row], gradients[row] = _shared(problem, places[row], scene_of(window), parts)
-    return torch.from_numpy(values).to(x), torch.from_numpy(gradients).to(x)
+    return torch.from_numpy(values).to(problem.view.ink.x), torch.from_numpy(gradients).to(x)
 
 
 def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slice]) -> tuple[float, Array]:
     """`searching.evaluate` of one window by several threads, each with a frame of its own for its part of the events."""
     look, frames = problem.look, _more_frames(len(parts), scene.frames[0])
-    exact, there = searching.homography_at(x, look, scene.normal, problem.terms)
+    exact, there = homography_at(x, look, scene.normal, problem.terms)
     H, totals = exact.astype(scene.lens.dtype), np.zeros((len(parts), *exact.shape))
     pieces = [tuple(array[part] for array in scene.events) for part in parts]
     reached: list[tuple[int, int]] = [(0, 0)] * len(parts)
@@ -131,17 +136,18 @@ def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slic
     searching.develop_slope(scene.kernel, scene.frames, scene.line, band)
     flat = scene.frames[0].reshape(-1)
     _spread(lambda i: events.draw_slopes(H, pieces[i], scene.lens, flat, totals[i]), [(i,) for i in range(len(parts))])
-    cost = searching.strain(there, exact, look, scene.some) + searching.lean(there, look)
+    cost = strain(there, exact, look, scene.some) + lean(there, look)
     energy = searching.energy_of(scene.events[3], look.contrast, scene.frames)
     with np.errstate(divide="ignore", invalid="ignore"):  # an empty image has no contrast
         value, to_H = cost - np.log(sharp / energy), totals.sum(0) / -sharp
-    return value, searching.chained(x, to_H, look, scene.normal, scene.some)
+    return value, chained(x, to_H, look, scene.normal, scene.some)
 
 
 def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor]:
     """`core.minimize` of `core.objective`, each row in machine code: x [B, P] | owner [B] -> the fields of a Minimum."""
     start, scene_of = _array(x.double()), problem.scene
-    limits = searching.Stop(*(getattr(stop, name) for name in searching.Stop._fields))
+    lengths = (float(n) for n in (stop.longest, stop.armijo, stop.wolfe))  # numba compiles anew for other kinds of numbers
+    limits = searching.Stop(float(stop.tolerance), int(stop.iterations), int(stop.trials), *lengths)
     found: list[Any] = [None] * len(x)
 
     def work(row: int, window: int) -> None:
@@ -159,12 +165,14 @@ def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor
 def lens_of(canvas: Any, like: Tensor) -> Array:
     """How rays meet the frame, in the numbers that kernels/events.py wants."""
     (height, width), (x, y) = canvas.size, canvas.centre
-    if (height + 2) * (width + 2) >= MOST[like.dtype]:
-        raise ValueError(f"a canvas of {height} x {width} px has more than {MOST[like.dtype]} pixels, the most that {like.dtype} can draw")
+    if kernels.frame(canvas) >= kernels.MOST[like.dtype]:
+        raise ValueError(
+            f"a canvas of {height} x {width} px has more than {kernels.MOST[like.dtype]} pixels, the most that {like.dtype} can draw"
+        )
     least = torch.finfo(like.dtype).tiny ** 0.5 if canvas.sphere else kernels.NEAREST
-    span = events.SPAN if like.dtype == torch.float32 else 0.0
-    numbers = [canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, span]
-    return np.array(numbers, "f4" if like.dtype == torch.float32 else "f8")
+    kind = "f4" if like.dtype == torch.float32 else "f8"
+    numbers = [canvas.focal, x + 1, y + 1, width + 1, height + 1, width + 2, least, canvas.sphere, events.SPAN[kind]]
+    return np.array(numbers, kind)
 
 
 def _array(x: Tensor) -> Array:
@@ -188,8 +196,8 @@ def _scratch(canvas: Any, taps: Array) -> tuple[Array, Array]:
     key = (canvas.size, len(taps), taps.dtype)
     if getattr(_own, "key", None) != key:
         height, width = canvas.size
-        _own.key = key
         _own.scratch = np.zeros((3, height + 2, width + 2), taps.dtype), np.zeros(width + 2 * len(taps), taps.dtype)
+        _own.key = key  # last, in case there was no memory
     scratch: tuple[Array, Array] = _own.scratch
     return scratch
 
@@ -213,14 +221,21 @@ def _parts(rows: int, count: int) -> list[slice]:
 def _spread(work: Callable[..., None], tasks: Sequence[tuple[int, ...]]) -> None:
     """Do every task, in the order in which threads become free; this thread is one of them."""
     waiting = iter(tasks)
+    stopped: list[BaseException] = []
 
     def drain() -> None:
         for task in waiting:  # one thread after the other takes the next: an iterator is safe
-            work(*task)
+            if not stopped:
+                work(*task)
 
     others = [_pool(os.getpid(), kernels.threads()).submit(drain) for _ in range(min(kernels.threads(), len(tasks)) - 1)]
     try:
         drain()
+    except BaseException as error:
+        stopped.append(error)
+        if isinstance(error, SystemError) and isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None  # Ctrl-C within compiled code, as numba tells it
+        raise
     finally:
         for other in others:
             other.result()

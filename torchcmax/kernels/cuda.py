@@ -115,7 +115,7 @@ def _corners(x, y, reached, width, height):
     return pixel, x - left, y - top, west & north, east & north, west & south, east & south
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@triton.jit(do_not_specialize=["width", "height", "events", "programs"])
 def _vote(
     frame_ptr, H_ptr, x_ptr, y_ptr, s_ptr, weight_ptr, owner_ptr, focal: tl.float64, centre_x: tl.float64, centre_y: tl.float64,
     width, height, events, programs, K: tl.constexpr, SPHERE: tl.constexpr, BLOCK: tl.constexpr,
@@ -161,7 +161,7 @@ def _to_ray(dx, dy, X, Y, Z, SPHERE: tl.constexpr):
         return dx / Z, dy / Z, -(dx * X + dy * Y) / Z / Z
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@triton.jit(do_not_specialize=["width", "height", "events", "programs"])
 def _slope(
     partial_ptr, gradient_ptr, H_ptr, x_ptr, y_ptr, s_ptr, weight_ptr, owner_ptr, focal: tl.float64, centre_x: tl.float64,
     centre_y: tl.float64, width, height, events, programs, K: tl.constexpr, SPHERE: tl.constexpr, BLOCK: tl.constexpr,
@@ -198,7 +198,7 @@ def _slope(
         tl.store(partial_ptr + tl.program_id(0).to(tl.int64) * 9 * K + i, tl.sum(sums[i], 0))
 
 
-@triton.jit(do_not_specialize=["height", "radius"])
+@triton.jit(do_not_specialize=["height", "width", "radius"])
 def _smooth(
     image_ptr, smooth_ptr, kernel_ptr, stride_a, stride_y, stride_x, height, width, radius,
     ALONG_X: tl.constexpr, BLOCK_Y: tl.constexpr, BLOCK_X: tl.constexpr,
