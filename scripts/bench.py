@@ -8,13 +8,12 @@ machine and on who else works on it.
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import os
 import platform
 import subprocess
 import sys
-import threading
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ from pathlib import Path
 import torch
 
 from torchcmax import __version__, kernels
-from torchcmax.compensate import Compensation, compensate
+from torchcmax.compensate import Compensation, compensate, load_kernels
 from torchcmax.core.camera import Canvas
 from torchcmax.core.draw import Ink, draw_twin
 from torchcmax.core.estimate import Estimate, Search, estimate
@@ -36,10 +35,9 @@ from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.window import Window
 from torchcmax.io import DataNote, Recording, open
 from torchcmax.report import writing
-from torchcmax.simulator import Simulation, simulate
+from torchcmax.simulator import Simulation, write
 
 Table = list[dict[str, object]]
-PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 def best(run: Callable[[], object], device: str, repeats: int = 7) -> tuple[float, float]:
@@ -159,64 +157,62 @@ def per_window(wall: float, cpu: float, found: Estimate, windows: int) -> dict[s
 
 
 def whole_recording(recording: Recording, device: str, threads: list[int]) -> Table:
-    """(c) All windows of a recording, and how much of the time reading alone would take; (d) memory that it adds at its peak."""
+    """(c) All windows of a recording: wall and CPU time, and what reading alone takes, as a share of the wall time."""
     rows: Table = []
     began = time.perf_counter()
-    windows = sum(len(window) for window in recording.windows(30000, batch=16))
+    windows = sum(len(window) for window in recording.windows(30000, batch=16, device=device))
     reading = time.perf_counter() - began
-    events = windows * 30000
     for name in MODELS:
         for count in threads:
             options = Compensation(model=name, device=device)  # type: ignore[arg-type]
-            with using(count), Peak(device) as peak:
-                began = time.perf_counter()
-                for _ in compensate(recording, options):
-                    pass
-                wall = time.perf_counter() - began
-            at = {"model": name, "threads": count, "windows": windows, "Mev/s": round(events / wall * 1e-6, 2)}
-            rows.append(at | {"reading alone, share": round(reading / wall, 2), "MB added": round(peak.megabytes)})
+            with using(count):
+                began, cpu = time.perf_counter(), time.process_time()
+                for _, found in compensate(recording, options):
+                    last = found.contrast
+                last.cpu()  # waits for a GPU
+                wall, cpu = time.perf_counter() - began, time.process_time() - cpu
+            at = {"model": name, "threads": count, "windows": windows, "Mev/s": round(windows * 0.03 / wall, 2)}
+            rows.append(at | {"CPU s": round(cpu, 2), "reading alone, share of wall": round(reading / wall, 2)})
     return rows
 
 
-class Peak:
-    """Memory that is taken within a with block beyond what was taken before: of the device, or resident on the CPU."""
+def memory(recording: Recording, device: str) -> Table:
+    """(d) Memory that compensating adds at its peak to what an opened recording takes, each in a process of its own."""
+    rows: Table = []
+    for name in MODELS:
+        for batch in (1, 16, 64):
+            arguments = [sys.executable, __file__, "--peak", name, str(batch), "--recording", str(recording.path), "--device", device]
+            done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+            rows.append({"model": name, "windows in a batch": batch, "MB added": float(done.stdout)})
+    return rows
 
-    megabytes = 0.0
 
-    def __init__(self, device: str) -> None:
-        self.device = device
+def peak(recording: Recording, name: str, batch: int, device: str) -> float:
+    """MB of the device, or resident on the CPU."""
+    load_kernels(device)
+    before = used(device)
+    for _ in compensate(recording, Compensation(model=name, batch=batch, limit=3 * batch, device=device)):  # type: ignore[arg-type]
+        pass
+    return round(used(device) - before)
 
-    def __enter__(self) -> Peak:
-        gc.collect()
-        if self.device != "cpu":
-            torch.cuda.reset_peak_memory_stats(self.device)
-        self._before, self._going = self._now(), True
-        self._watch = threading.Thread(target=self._sample, daemon=True)
-        self._watch.start()
-        return self
 
-    def _now(self) -> float:
-        if self.device != "cpu":
-            return torch.cuda.max_memory_allocated(self.device) / 1e6
-        return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 1e6 if Path("/proc/self/statm").exists() else 0.0
-
-    def _sample(self) -> None:
-        while self._going:
-            self.megabytes = max(self.megabytes, self._now() - self._before)
-            time.sleep(0.01)
-
-    def __exit__(self, *exception: object) -> None:
-        self._going = False
-        self._watch.join()
+def used(device: str) -> float:
+    """MB at the peak so far."""
+    if device != "cpu":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    status = Path("/proc/self/status")  # getrusage would tell the peak of the process that started this one, if that was larger
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM")), float("nan"))
 
 
 def limits(recording: Recording, window: Window, device: str) -> Table:
-    """(e) What the device can do at best: copying, and adding to four pixels of an image for each event; and our share of it."""
+    """(e) Copying, and torch adding to four pixels of an image for each event; and how we compare, reading events twice an evaluation."""
     canvas, model = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx)
     ink, owner = Ink.of(window, window.weight), torch.arange(len(window), device=device)
     events = ink.weight.numel()
     source = torch.empty(1 << (24 if device == "cpu" else 28), device=device)
-    copy = 2 * source.numel() * 4 / best(lambda: source.clone(), device)[0]
+    target = torch.empty_like(source)
+    copy = 2 * source.numel() * 4 / best(lambda: target.copy_(source), device)[0]
     pixels = canvas.size[0] * canvas.size[1]
     place = torch.randint(0, pixels, (len(window), 4 * ink.weight.shape[1]), device=device)
     image, ones = torch.zeros(len(window), pixels, device=device), torch.ones(place.shape, device=device)
@@ -226,9 +222,10 @@ def limits(recording: Recording, window: Window, device: str) -> Table:
     ours = best(partial(objective(Look(), model, view, owner), x, owner), device)[0] / events
     moved = 2 * 16 / ours  # x, y, s, weight, once for the votes and once for the gradient
     return [
-        {"limit": "copy", "measured": f"{copy * 1e-9:.1f} GB/s", "value and gradient": f"{moved * 1e-9:.1f} GB/s of events read"},
-        {"limit": "four additions to random pixels", "measured": f"{added * 1e9:.2f} ns", "value and gradient": f"{ours * 1e9:.2f} ns"},
-    ]
+        {"limit": "copy", "GB/s": round(copy * 1e-9, 1), "our GB/s": round(moved * 1e-9, 1), "ratio": round(moved / copy, 2)},
+        {"limit": "scatter_add_ to four pixels an event", "ns": round(added * 1e9, 1), "our ns": round(ours * 1e9, 1),
+         "ratio": round(added / ours, 2)},
+    ]  # fmt: skip
 
 
 def machine(device: str) -> dict[str, object]:
@@ -254,10 +251,26 @@ def machine(device: str) -> dict[str, object]:
 
 def printed(title: str, rows: Table) -> None:
     """A table in Markdown."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
     print(f"\n### {title}\n")
-    print("| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
+    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for row in rows:
-        print("| " + " | ".join(str(value) for value in row.values()) + " |")
+        print("| " + " | ".join(str(row.get(name, "")) for name in columns) + " |")
+
+
+def tables_of(recordings: list[Recording], windows: int, device: str, threads: list[int]) -> dict[str, Table]:
+    """All tables, by their titles."""
+    first = next(recordings[0].windows(30000, batch=windows)).to(device, torch.float32)
+    load_kernels(device)
+    tables = {"One evaluation: value and gradient, 8 parameters": evaluations(recordings[0], first, device, threads)}
+    for recording in recordings:
+        window = next(recording.windows(30000, batch=windows)).to(device, torch.float32)
+        tables[f"A cold window of 30,000 events of {recording.name}"] = cold_windows(recording, window, device)
+    for recording in recordings:
+        tables[f"The whole of {recording.name}"] = whole_recording(recording, device, threads)
+    tables["Memory"] = memory(recordings[0], device)
+    tables["What the device can do"] = limits(recordings[0], first, device)
+    return tables
 
 
 def main() -> int:
@@ -267,21 +280,19 @@ def main() -> int:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="on the CPU")
     parser.add_argument("--windows", type=int, default=10, help="windows of 30,000 events in a batch")
     parser.add_argument("--json", type=Path, help="write the tables to this file too")
+    parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     warnings.simplefilter("ignore", DataNote)
     threads = options.threads if options.device == "cpu" else [1]
     torch.set_num_threads(threads[0])
-    recordings = [open(name) for name in options.recording] or [simulate(Simulation(duration=0.5))]
-    first = recordings[0]
-    window = next(first.windows(30000, batch=options.windows)).to(options.device, torch.float32)
-    about = machine(options.device)
-    tables = {"One evaluation: value and gradient, 8 parameters": evaluations(first, window, options.device, threads)}
-    for recording in recordings:
-        window = next(recording.windows(30000, batch=options.windows)).to(options.device, torch.float32)
-        tables[f"A cold window of 30,000 events of {recording.name}"] = cold_windows(recording, window, options.device)
-    for recording in recordings:
-        tables[f"The whole of {recording.name}, and memory"] = whole_recording(recording, options.device, threads)
-    tables["What the device can do"] = limits(first, window, options.device)
+    if options.peak:
+        print(peak(open(options.recording[0]), options.peak[0], int(options.peak[1]), options.device))
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        if not options.recording:
+            write(Simulation(duration=0.5), Path(folder) / "poster")
+        recordings = [open(name) for name in options.recording or [Path(folder) / "poster"]]
+        about, tables = machine(options.device), tables_of(recordings, options.windows, options.device, threads)
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     for title, rows in tables.items():
         printed(title, rows)
