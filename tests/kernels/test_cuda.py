@@ -180,7 +180,7 @@ def test_no_rows_and_no_events_are_no_work(make):
 
 @BOTH
 def test_draw_by_the_kernels_has_the_gradient_of_float64(device, canvas, monkeypatch):
-    monkeypatch.setattr(kernels, "drawing", lambda like: cuda)
+    monkeypatch.setattr(kernels, "drawing", lambda like, pixels=0: cuda)
     g = torch.Generator().manual_seed(0)
     x, y, s, weight = (torch.rand(4, 1, 6, generator=g, dtype=torch.float64) - 0.5).to(device)
     H_k = (torch.eye(3).expand(1, 2, 3, 3) + 0.2 * torch.rand(1, 2, 3, 3, generator=g, dtype=torch.float64)).to(device).requires_grad_()

@@ -198,7 +198,7 @@ def _slope(
         tl.store(partial_ptr + tl.program_id(0).to(tl.int64) * 9 * K + i, tl.sum(sums[i], 0))
 
 
-@triton.jit(do_not_specialize=["height", "width", "radius"])
+@triton.jit(do_not_specialize=["height", "radius"])
 def _smooth(
     image_ptr, smooth_ptr, kernel_ptr, stride_a, stride_y, stride_x, height, width, radius,
     ALONG_X: tl.constexpr, BLOCK_Y: tl.constexpr, BLOCK_X: tl.constexpr,
