@@ -220,41 +220,29 @@ def reach(pixel, least, most):
 
 
 @compiled
-def scratch_for(dtype):
-    """What one block needs: near, ray, share, pixel."""
-    return np.empty((3, 3, 3), dtype), np.empty((3, BLOCK), dtype), np.empty((3, BLOCK), dtype), np.empty(BLOCK, np.int32)
-
-
-@compiled
-def place(H, block, s_0, lens, scratch):
-    """Where the events x, y, s, weight of a block meet the frame: left in the scratch."""
-    x, y, s, weight = block
-    near, ray, share, pixel = scratch
-    expand(H, s_0, near)
-    carry(near, s_0, x, y, s, ray)
-    if lens[7]:
-        land_round(ray, weight, lens, pixel, share)
-    else:
-        land(ray, weight, lens, pixel, share)
-
-
-@compiled
 def draw(H, events, lens, frame):
     """Warp the events of a window and vote: H [K, 3, 3] | events: x, y, s, weight [N] | frame [(H + 2) (W + 2)], added to.
 
     -> the first row of the frame that has votes, and the one after the last
     """
     x, y, s, weight = events
-    last, stride, scratch = count(weight), np.int64(lens[5]), scratch_for(x.dtype)
-    _, _, share, pixel = scratch
+    last, stride = count(weight), np.int64(lens[5])
+    near, ray, share = np.empty((3, 3, 3), x.dtype), np.empty((3, BLOCK), x.dtype), np.empty((3, BLOCK), x.dtype)
+    pixel = np.empty(BLOCK, np.int32)
     i, size, least, most = 0, BLOCK, np.int32(len(frame)), np.int32(0)
     while i < last:
         end, s_0 = block_end(s, i, last, lens[8], size)
         n = end - i
-        place(H, (x[i:end], y[i:end], s[i:end], weight[i:end]), s_0, lens, scratch)
+        size = min(BLOCK, 2 * n)  # the next block is about as long
+        expand(H, s_0, near)
+        carry(near, s_0, x[i:end], y[i:end], s[i:end], ray)
+        if lens[7]:
+            land_round(ray, weight[i:end], lens, pixel, share)
+        else:
+            land(ray, weight[i:end], lens, pixel, share)
         scatter(pixel[:n], share, stride, frame)
         least, most = reach(pixel[:n], least, most)
-        i, size = end, min(BLOCK, 2 * n)  # the next block is about as long
+        i = end
     return least // stride, most // stride + 2
 
 
@@ -262,13 +250,20 @@ def draw(H, events, lens, frame):
 def draw_slopes(H, events, lens, frame, total):
     """The derivative of `draw`: frame = dL/dframe | total [K, 3, 3] float64, added to."""
     x, y, s, weight = events
-    last, stride, scratch = count(weight), np.int64(lens[5]), scratch_for(x.dtype)
-    near, ray, share, pixel = scratch
+    last, stride = count(weight), np.int64(lens[5])
+    near, ray, share = np.empty((3, 3, 3), x.dtype), np.empty((3, BLOCK), x.dtype), np.empty((3, BLOCK), x.dtype)
+    pixel = np.empty(BLOCK, np.int32)
     i, size = 0, BLOCK
     while i < last:
         end, s_0 = block_end(s, i, last, lens[8], size)
         n = end - i
-        place(H, (x[i:end], y[i:end], s[i:end], weight[i:end]), s_0, lens, scratch)
+        size = min(BLOCK, 2 * n)  # the next block is about as long
+        expand(H, s_0, near)
+        carry(near, s_0, x[i:end], y[i:end], s[i:end], ray)
+        if lens[7]:
+            land_round(ray, weight[i:end], lens, pixel, share)
+        else:
+            land(ray, weight[i:end], lens, pixel, share)
         look(pixel[:n], share, stride, frame)
         if lens[7]:
             leave_round(share, ray, n, lens)
@@ -276,4 +271,4 @@ def draw_slopes(H, events, lens, frame, total):
             leave(share, ray, n, lens)
         gather(share, x[i:end], y[i:end], s[i:end], s_0, near)
         collect(near, s_0, total)
-        i, size = end, min(BLOCK, 2 * n)
+        i = end
