@@ -165,7 +165,7 @@ def metric(look: Look, model: Model, some: Ink, x: Tensor, owner: Tensor) -> Ten
     return G + RIDGE * mean[:, None, None] * steps
 
 
-IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order of kernels/search.py
+IN_MACHINE_CODE = (Rotation, Translation, PlanarKnown, Planar)  # in the order of kernels/motion.py
 
 
 def problem(look: Look, model: Model, view: View) -> Any:
