@@ -6,5 +6,6 @@ from torchcmax.io.hdf5 import save
 from torchcmax.io.opening import OpenOptions, open
 from torchcmax.io.overview import Summary, summary
 from torchcmax.io.recording import Recording
+from torchcmax.io.stream import Stream
 
-__all__ = ["DataError", "DataNote", "DataWarning", "Events", "OpenOptions", "Recording", "Summary", "open", "save", "summary"]
+__all__ = ["DataError", "DataNote", "DataWarning", "Events", "OpenOptions", "Recording", "Stream", "Summary", "open", "save", "summary"]

@@ -15,6 +15,7 @@ from torchcmax.core.pose import Trajectory
 from torchcmax.core.window import Window
 from torchcmax.io.errors import DataError
 from torchcmax.io.events import Events, Packed
+from torchcmax.io.stream import Stream
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,14 @@ class Recording:
         table = self.camera.rays().view(-1, 3).to(device, torch.float32)
         for block in self._blocks(events, stride, batch):
             yield Packed.of(block, self.camera.size, device.type == "cuda").window(table)
+
+    def stream(self, start: float | None = None, end: float | None = None, device: torch.device | str = "cpu") -> Stream:
+        """Consecutive windows of a size that is decided each time, of the events from start (inclusive) to end (exclusive).
+
+        start, end: seconds of the recording's own clock, to the nearest µs; None: from the first event, to the last.  DataError where
+        that is no stretch of time; where it lies outside the recording, the first `take` says so.
+        """
+        return Stream(self, start, end, device)
 
     def _blocks(self, events: int, stride: int, batch: int) -> Iterator[Events]:
         """The events of `batch` windows at a time, [batch, events]; fewer windows only at the end."""
