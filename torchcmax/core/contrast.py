@@ -23,7 +23,7 @@ class _Blur(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, sigma: float) -> Tensor:
         ctx.sigma = sigma
-        if image.is_cuda and (fast := kernels.drawing(image)) is not None:
+        if (fast := kernels.drawing(image)) is not None:
             smoothed: Tensor = fast.smooth(image, sigma)
             return smoothed
         together = max(1, len(image)) if image.is_cuda else 1  # on the CPU one image at a time stays in the cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -41,6 +42,12 @@ class Ink:
         """weight [W, N] that events vote with | reference: the time warped to, 0 the window's first event, 1 its last."""
         parts = window.ray[..., 0], window.ray[..., 1], window.phase - reference, weight
         return cls(*(part.contiguous() for part in parts))
+
+    @classmethod
+    def join(cls, parts: Sequence[Ink]) -> Ink:
+        """Windows of different lengths together, the shorter ones padded with weight 0."""
+        longest = max(part.x.shape[-1] for part in parts)
+        return cls(*(torch.cat([pad(getattr(p, f.name), (0, longest - p.x.shape[-1])) for p in parts]) for f in fields(cls)))
 
     def __getitem__(self, index: slice | Tensor) -> Ink:
         """Some of the windows."""
@@ -122,3 +129,29 @@ class _Kernel(torch.autograd.Function):
 
 def _kernel(ink: Ink) -> Any:
     return kernels.drawing(ink.x)
+
+
+def draw_sum(H_k: Tensor, ink: Ink, canvas: Screen) -> Tensor:
+    """`draw` of many windows into one image: H_k [W, K, 3, 3] | ink of W windows -> [1, H, W].  Differentiable to H_k, once."""
+    if H_k.ndim != 4 or len(H_k) != len(ink.x):
+        raise ValueError(f"draw_sum wants H_k [W, K, 3, 3] for ink of {len(ink.x)} windows, got {[*H_k.shape]}")
+    if kernels.drawing(ink.x, kernels.frame(canvas)) is not None and not ink.x.is_cuda:
+        return canvas.folded(_Sum.apply(H_k, ink, canvas))
+    return draw(H_k, ink, canvas, torch.arange(len(H_k), device=H_k.device)).sum(0, keepdim=True)
+
+
+class _Sum(torch.autograd.Function):
+    """The frame of all windows together by the kernels of the CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, H_k: Tensor, ink: Ink, canvas: Screen) -> Tensor:
+        ctx.save_for_backward(H_k)
+        ctx.ink, ctx.canvas = ink, canvas
+        image: Tensor = _kernel(ink).votes_sum(H_k, ink, canvas)
+        return image
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (H_k,) = ctx.saved_tensors
+        return _kernel(ctx.ink).slopes_sum(H_k, ctx.ink, ctx.canvas, gradient), None, None

@@ -59,13 +59,15 @@ class _Rows:
     Every method works on all rows at once and chooses by masks, so that a GPU needs not be waited for.
     """
 
-    def __init__(self, x: Tensor, value: Tensor, gradient: Tensor, metric: Tensor, stop: Stop) -> None:
+    def __init__(self, x: Tensor, value: Tensor, gradient: Tensor, metric: Tensor, stop: Stop, inverse: Tensor | None) -> None:
         self.x, self.value, self.gradient, self.metric, self.stop = x.clone(), value, gradient, metric, stop
-        self.plain = self.inverse = torch.linalg.inv(metric)  # inverse Hessian as long as nothing is known of the curvature
+        self.known = inverse is not None  # else the metric is the inverse Hessian's shape, and its scale is to be found
+        self.plain = self.inverse = torch.linalg.inv(metric) if inverse is None else inverse
         self.step = torch.zeros_like(x)
         self.length = self.low = self.high = torch.zeros_like(x[:, 0])
         self.iterations = self.trials = torch.zeros_like(value, dtype=torch.int64)
-        self.scaled, self.converged = torch.zeros_like(value, dtype=torch.bool), gradient.abs().amax(-1) == 0
+        self.scaled, self.fresh = torch.full_like(value, self.known, dtype=torch.bool), torch.ones_like(value, dtype=torch.bool)
+        self.converged = gradient.abs().amax(-1) == 0
         self.done = self.converged | ~value.isfinite()
         self.aim(~self.done)
 
@@ -96,13 +98,13 @@ class _Rows:
         self.inverse = torch.where(usable[:, None, None], inverse, self.inverse)
         self.x, self.gradient = (torch.where(rows[:, None], *both) for both in ((x, self.x), (gradient, self.gradient)))
         self.value = torch.where(rows, value, self.value)
-        self.scaled = self.scaled | usable
+        self.scaled, self.fresh = self.scaled | usable, self.fresh & ~usable
         self.iterations = self.iterations + rows
 
     def forget(self, rows: Tensor) -> None:
         """Perhaps the curvature of these rows was wrong: once more without it."""
         self.inverse = torch.where(rows[:, None, None], self.plain, self.inverse)
-        self.scaled = self.scaled & ~rows
+        self.scaled, self.fresh = self.scaled & ~rows | self.known, self.fresh | rows
 
     def judge(self, good: Tensor, stuck: Tensor) -> None:
         """Which rows are done: the full step is shorter than the tolerance, or nothing can be done where they are stuck."""
@@ -113,17 +115,20 @@ class _Rows:
         self.done = self.done | self.converged | spent
 
 
-def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop: Stop | None = None) -> Minimum:
+def minimize(
+    objective: Objective, x: Tensor, metric: Tensor | None = None, stop: Stop | None = None, inverse: Tensor | None = None
+) -> Minimum:
     """Quasi-Newton (BFGS) from x, row by row; a row that is done is no longer evaluated.
 
     x [B, P] | metric [B, P, P] positive definite: squared length of a step, and the first guess of the curvature's shape
+    inverse [B, P, P]: of the Hessian, where something is known of it and of its scale
 
     It is L-BFGS whose history is never cut: at P <= 12 the inverse Hessian is smaller than the vectors L-BFGS keeps.
     Line search by bracketing to the weak Wolfe conditions (Nocedal & Wright, Numerical Optimization, ch. 3 and 6).
     """
     stop = stop or Stop()
     metric = _eye(x).expand(len(x), -1, -1) if metric is None else metric
-    state = _Rows(x, *objective(x, torch.arange(len(x), device=x.device)), metric, stop)
+    state = _Rows(x, *objective(x, torch.arange(len(x), device=x.device)), metric, stop, inverse)
     trace, evaluations = [state.value], torch.ones_like(state.iterations)
     while len(rows := (going := ~state.done).nonzero()[:, 0]):  # the one line of a round that waits for a GPU
         value, length, step = state.value, state.length, state.step
@@ -137,7 +142,7 @@ def minimize(objective: Objective, x: Tensor, metric: Tensor | None = None, stop
         parabola = -slope * length * length / (2 * (value_new - value - slope * length))  # through both values and the slope
         state.shrink(parabola, too_long)
         stuck = ~good & (state.high * state.norm < stop.tolerance)  # the bracket is shorter than the tolerance
-        again = stuck & state.scaled
+        again = stuck & ~state.fresh
         state.accept(good, x_new, value_new, gradient_new)
         state.forget(again)
         state.aim(good | again)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +18,11 @@ class Plane:
 
     normal: Tensor
     distance: Tensor
+
+    @classmethod
+    def join(cls, parts: Sequence[Plane]) -> Plane:
+        """Several planes together."""
+        return cls(torch.cat([p.normal for p in parts]), torch.cat([p.distance for p in parts]))
 
     @classmethod
     def tilted(cls, tilt: Tensor) -> Plane:
@@ -39,6 +45,15 @@ class Plane:
         """The same plane in the camera's frame: n_c = R_cw n_w, d_c = d_w + t_wc . n_w, before eq. (2.10)."""
         normal = (pose.R.mT @ self.normal[..., None])[..., 0]
         return Plane(normal, self.distance + (pose.t * self.normal).sum(-1))
+
+    def across(self) -> Tensor:
+        """Two directions along the plane, orthogonal to each other and to the normal: [B, 2, 3]."""
+        return self.facing()[:, :2]
+
+    def leaning(self, step: Tensor) -> Plane:
+        """The plane whose normal goes by a small step [B, 2] rad along `across`, at the same distance."""
+        normal = self.normal + (step[:, :, None] * self.across()).sum(1)
+        return Plane(torch.nn.functional.normalize(normal, dim=-1), self.distance)
 
     def facing(self) -> Tensor:
         """Rotation that turns the normal to (0, 0, -1), eq. (2.12), (2.13): [B, 3, 3]."""

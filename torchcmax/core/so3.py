@@ -13,30 +13,34 @@ def hat(w: Tensor) -> Tensor:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).view(*w.shape[:-1], 3, 3)
 
 
-def _sine_ratios(w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ for w [..., 3] -> each [..., 1, 1]."""
+def _sine_ratios(w: Tensor) -> tuple[Tensor, Tensor]:
+    """sin θ/θ and (1 − cos θ)/θ² for w [..., 3] -> each [..., 1, 1]."""
     theta2 = (w * w).sum(-1)[..., None, None]
     small = theta2 < SMALL
-    safe = torch.where(small, 1.0, theta2)  # keeps the unused branch free of nan gradients
-    theta = safe.sqrt()
+    theta = torch.where(small, 1.0, theta2).sqrt()  # keeps the unused branch free of nan gradients
     half = (theta / 2).sin() / theta
     a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20), theta.sin() / theta)
-    b = torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30), 2 * half * half)
-    c = torch.where(small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42), (1 - theta.sin() / theta) / safe)
-    return a, b, c
+    return a, torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30), 2 * half * half)
+
+
+def _third_ratio(w: Tensor, a: Tensor) -> Tensor:
+    """(θ − sin θ)/θ³ for w [..., 3], from a = sin θ/θ -> [..., 1, 1]."""
+    theta2 = (w * w).sum(-1)[..., None, None]
+    small = theta2 < SMALL
+    return torch.where(small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42), (1 - a) / torch.where(small, 1.0, theta2))
 
 
 def exp(w: Tensor) -> Tensor:
     """Rotation matrix of a rotation vector, eq. (2.8): w [..., 3] rad -> [..., 3, 3]."""
-    a, b, _ = _sine_ratios(w)
+    a, b = _sine_ratios(w)
     k = hat(w)
     return torch.eye(3, dtype=w.dtype, device=w.device) + a * k + b * (k @ k)
 
 
 def right_jacobian(w: Tensor) -> Tensor:
     """J with exp(w + dw) = exp(w) exp(J dw), the first-order step of eq. (A.8): w [..., 3] rad -> [..., 3, 3]."""
-    _, b, c = _sine_ratios(w)
-    k = hat(w)
+    a, b = _sine_ratios(w)
+    k, c = hat(w), _third_ratio(w, a)
     return torch.eye(3, dtype=w.dtype, device=w.device) - b * k + c * (k @ k)
 
 

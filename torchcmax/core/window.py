@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,21 @@ class Window:
 
     def __getitem__(self, index: Tensor | slice) -> Window:
         return Window(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def join(cls, parts: Sequence[Window]) -> Window:
+        """Windows of different lengths together, the shorter ones padded."""
+        longest = max(part.ray.shape[1] for part in parts)
+        if len(parts) == 1:
+            return parts[0]
+        spare = [longest - part.ray.shape[1] for part in parts]
+        return cls(
+            torch.cat([torch.cat([p.ray, p.ray[:, -1:].expand(-1, n, -1)], 1) for p, n in zip(parts, spare, strict=True)]),
+            torch.cat([torch.cat([p.dt, p.dt[:, -1:].expand(-1, n)], 1) for p, n in zip(parts, spare, strict=True)]),
+            torch.cat([pad(p.polarity, (0, n)) for p, n in zip(parts, spare, strict=True)]),
+            torch.cat([p.start for p in parts]),
+            torch.cat([p.duration for p in parts]),
+        )
 
     def thinned(self, step: int) -> Window:
         """Every step-th event of each window; start and duration stay those of the whole."""

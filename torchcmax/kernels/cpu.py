@@ -18,6 +18,8 @@ from torch import Tensor
 
 from torchcmax import kernels
 from torchcmax.kernels import events, image
+from torchcmax.kernels import match as matching
+from torchcmax.kernels import place as placing
 from torchcmax.kernels import search as searching
 from torchcmax.kernels.compiling import forget_stale
 from torchcmax.kernels.image import CONTRASTS
@@ -88,6 +90,28 @@ def slopes(H_k: Tensor, ink: Any, canvas: Any, owner: Tensor, gradient: Tensor) 
     return torch.from_numpy(totals.sum(0)).to(H_k)
 
 
+def votes_sum(H_k: Tensor, ink: Any, canvas: Any) -> Tensor:
+    """The frame of all windows together: H_k [W, K, 3, 3] | ink of W windows -> [1, H + 2, W + 2]; a part of the windows each thread."""
+    H, rows, lens = _array(H_k.to(ink.x)), _rows(ink), lens_of(canvas, ink.x)
+    shares = np.array_split(np.arange(len(H)), min(kernels.threads(), max(1, ink.x.numel() // PART)))
+    frames = np.zeros((len(shares), (canvas.size[0] + 2) * (canvas.size[1] + 2)), lens.dtype)
+
+    def work(i: int) -> None:
+        for window in shares[i]:
+            events.draw(H[window], rows(window), lens, frames[i])
+
+    _spread(work, [(i,) for i in range(len(shares))])
+    return torch.from_numpy(frames.sum(0) if len(shares) > 1 else frames[0]).view(1, canvas.size[0] + 2, canvas.size[1] + 2)
+
+
+def slopes_sum(H_k: Tensor, ink: Any, canvas: Any, gradient: Tensor) -> Tensor:
+    """The derivative of `votes_sum`: gradient = dL/dframe [1, H + 2, W + 2] -> dL/dH_k [W, K, 3, 3]."""
+    H, rows, lens = _array(H_k.to(ink.x)), _rows(ink), lens_of(canvas, ink.x)
+    frame, totals = _array(gradient.to(ink.x)).reshape(-1), np.zeros(H.shape)
+    _spread(lambda window: events.draw_slopes(H[window], rows(window), lens, frame, totals[window]), [(i,) for i in range(len(H))])
+    return torch.from_numpy(totals).to(H_k)
+
+
 def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
     """Normalized contrast of the blurred image of warped events on a pinhole canvas: H_k [A, K, 3, 3] | owner [A] -> [A]."""
     H, code, scene_of = _array(H_k.to(view.ink.x)), image.CONTRASTS.index(contrast), _scenes(view, view.ink.x.new_zeros(len(view.ink.x), 3))
@@ -146,8 +170,7 @@ def _shared(problem: Problem, x: Array, scene: searching.Scene, parts: list[slic
 def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor]:
     """`core.minimize` of `core.objective`, each row in machine code: x [B, P] | owner [B] -> the fields of a Minimum."""
     start, scene_of = _array(x.double()), problem.scene
-    lengths = (float(n) for n in (stop.longest, stop.armijo, stop.wolfe))  # numba compiles anew for other kinds of numbers
-    limits = searching.Stop(float(stop.tolerance), int(stop.iterations), int(stop.trials), *lengths)
+    limits = _limits(stop)
     found: list[Any] = [None] * len(x)
 
     def work(row: int, window: int) -> None:
@@ -160,6 +183,25 @@ def search(problem: Problem, x: Tensor, owner: Tensor, stop: Any) -> list[Tensor
         trace[row, : len(values)] = values
     place, value, iterations, evaluations, converged = (torch.from_numpy(np.array(n)) for n in numbers)
     return [place.to(x), value.to(x), iterations, evaluations, converged, torch.from_numpy(trace).to(x)]
+
+
+def smooth(x: Tensor, sigma: float) -> Tensor:
+    """`core.contrast.blur`: image [B, H, W] | sigma px -> [B, H, W]."""
+    taps = _taps(float(sigma), x.dtype)
+    height, width = x.shape[1:]
+    framed, result = _array(torch.nn.functional.pad(x, (1, 1, 1, 1))), np.zeros((len(x), height + 2, width + 2), taps.dtype)
+
+    def work(i: int) -> None:
+        image.blur(framed[i], taps, np.zeros(width + 2 * len(taps), taps.dtype), result[i], (0, height + 2))
+
+    _spread(work, [(i,) for i in range(len(x))])
+    return torch.from_numpy(result[:, 1:-1, 1:-1]).contiguous()
+
+
+def _limits(stop: Any) -> searching.Stop:
+    """In numbers of one kind each: numba compiles anew for others."""
+    lengths = (float(n) for n in (stop.longest, stop.armijo, stop.wolfe))
+    return searching.Stop(float(stop.tolerance), int(stop.iterations), int(stop.trials), *lengths)
 
 
 def lens_of(canvas: Any, like: Tensor) -> Array:
@@ -233,15 +275,78 @@ def _spread(work: Callable[..., None], tasks: Sequence[tuple[int, ...]]) -> None
         drain()
     except BaseException as error:
         stopped.append(error)
-        if isinstance(error, SystemError) and isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None  # Ctrl-C within compiled code, as numba tells it
+        if isinstance(error, SystemError) and interrupted(error):
+            raise KeyboardInterrupt from None
         raise
     finally:
         for other in others:
             other.result()
 
 
+def interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is what an error comes from: within compiled code numba hides it behind others."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 @lru_cache(maxsize=1)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     """One for each process, as threads do not outlive a fork."""
     return ThreadPoolExecutor(threads, "torchcmax")
+
+
+def match(q: Tensor, task: Any, how: Any, ridge: float, closest: float, terms: int) -> list[Tensor]:
+    """`core.match.descend`, each row in machine code: q [B, M] -> x [B, 14], cost, slope, information, sum T, evaluations, converged."""
+    start, basis, prior = _array(q.double()), _array(task.basis.double()), _array(task.prior.double())
+    rows, some, chart = _rows(task.ink), _rows(task.some), task.chart
+    ghosts = _rows(task.ink if task.ghosts is None else task.ghosts)
+    limits, weight = _limits(how.stop), float(how.weight * how.every)
+    like = task.ink.x
+    texture = _array(chart.frame.to(like)).reshape(len(chart.texture), -1)
+    ground = (
+        texture if task.ground is None else _array(torch.nn.functional.pad(task.ground.to(like), (1, 1, 1, 1))).reshape(len(texture), -1)
+    )
+    lens = _flat_lens(chart.focal, tuple(chart.texture.shape[1:]), like.dtype)
+    places, found = _places(task, closest), [None] * len(q)
+
+    def work(row: int) -> None:
+        both = texture[row], ground[row]
+        chance = ghosts(row) if task.ghosts is not None else rows(row, slice(0))
+        numbers = places(row), prior[row], rows(row), chance, some(row), lens, both, limits, weight, terms, ridge
+        found[row] = matching.match(start[row], basis, *numbers)
+
+    _spread(work, [(row,) for row in range(len(q))])
+    return [torch.from_numpy(np.array(part)).to(q.dtype if i < 5 else None) for i, part in enumerate(zip(*found, strict=True))]
+
+
+def _places(task: Any, closest: float) -> Callable[[int], placing.Place]:
+    """Where the rows of a task are, in numbers."""
+    state, plane, chart = task.predicted, task.plane, task.chart
+    tensors = (
+        state.pose.R,
+        state.pose.t,
+        state.motion.omega,
+        state.motion.velocity,
+        plane.normal,
+        plane.across(),
+        plane.distance,
+        chart.view,
+        chart.corner,
+    )
+    R, t, omega, velocity, normal, across, distance, view, corner = (_array(part.double()) for part in tensors)
+    seconds, focal = _array(task.seconds.double()), float(chart.focal)
+
+    def place(i: int) -> placing.Place:
+        known = normal[i], across[i], float(distance[i]), closest, view[i], corner[i]
+        return placing.Place(R[i], t[i], omega[i], velocity[i], *known, float(seconds[i]), focal)
+
+    return place
+
+
+@lru_cache(maxsize=64)
+def _flat_lens(focal: float, size: tuple[int, int], dtype: torch.dtype) -> Array:
+    """The lens of a texture whose first pixel's middle is the centre."""
+    kind = "f4" if dtype == torch.float32 else "f8"
+    height, width = size
+    return np.array([focal, 1, 1, width + 1, height + 1, width + 2, kernels.NEAREST, 0, events.SPAN[kind]], kind)
