@@ -1,0 +1,1 @@
+"""Tracking and mapping: windows of events in, poses and a map out."""

@@ -1,0 +1,160 @@
+"""What the map is made of: a first plane from several windows together, keyframes, and their joint optimization."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from torchcmax.core.draw import Ink
+from torchcmax.core.joint import Frames, Joint, Solved, optimize_chain
+from torchcmax.core.match import NUMBERS, Match, Matching, Task, match, units
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Motion, Pose
+from torchcmax.core.state import SIZE, State
+from torchcmax.core.window import Window
+from torchcmax.slam.map import Area, Map
+from torchcmax.slam.tracker import SOME
+
+MOST_TILT = 0.05  # rad in a round
+LOOSE = 5.0, 2.0  # px: how far the pose and the motion of a keyframe go in a round, one sigma
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """How the map is made."""
+
+    first: int = 16
+    """Windows that the first plane is estimated from."""
+    joint: Joint = field(default_factory=Joint)
+    """How the first plane is estimated from them."""
+    thinned: int = 6000
+    """Events of each of them that are used at most."""
+    settle: int = 4
+    """Rounds of joint optimization of the first keyframes."""
+    overlap: float = 0.8
+    """A window of which less is known becomes a keyframe."""
+    every: int = 4
+    """Keyframes from one joint optimization to the next."""
+    last: int = 10
+    """Keyframes that are optimized at a time."""
+    until: int = 30
+    """New keyframes after which the joint optimization waits for the end."""
+    final: int = 1
+    """Rounds of joint optimization of all keyframes at the end."""
+    tilt: float = 10.0
+    """degrees: what the first plane may be off, one sigma."""
+    doubt: float = 10.0
+    """How many times less certain the plane is than its events say, as what biases it is the same in all of them."""
+
+
+def thinned(ink: Ink, most: int) -> Ink:
+    """At most so many events of each window, evenly."""
+    return ink.thinned(max(1, -(-ink.x.shape[-1] // most)))
+
+
+def first_plane(windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, tilt: Tensor) -> Solved:
+    """Consecutive windows before one plane, from their own motions [1] before a wall: all motions and the plane together.
+
+    tilt [1, 2] rad: the plane to start from
+    """
+    wall = Plane.tilted(tilt)
+    count, middle = len(windows), len(windows) // 2
+    inks = Ink.join([thinned(Ink.of(w, w.weight), how.thinned) for w in windows])
+    seconds = torch.cat([w.duration for w in windows]).double()
+    motion = Motion(torch.cat([m.omega for m in motions]), torch.cat([m.velocity for m in motions]))
+    rest = Pose(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), torch.zeros(count, 3, dtype=torch.float64))
+    return optimize_chain(Frames(State(rest, motion), seconds, inks, wall), focal, how.joint, middle)
+
+
+def rebased(frames: Frames) -> Frames:
+    """In the world of the camera at the first window's first event, whose distance from the plane is one."""
+    first = frames.state[:1].later(-frames.seconds[:1] / 2).pose
+    plane = frames.plane.seen_from(first)
+    back = first.inverse()
+    count, scale = len(frames), plane.distance
+    pose = Pose(back.R.expand(count, 3, 3), back.t.expand(count, 3)) @ frames.state.pose
+    state = State(Pose(pose.R, pose.t / scale), Motion(frames.state.motion.omega, frames.state.motion.velocity / scale))
+    return replace(frames, state=state, plane=Plane(plane.normal, torch.ones_like(scale)))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A map after a round of joint optimization, and by how much its plane tilted, rad [2], given what is still open about it."""
+
+    map: Map
+    tilt: Tensor
+    cost: float
+
+
+def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | None = None) -> Settled:
+    """One round of joint optimization: each of the last keyframes [k] finds its place in the map of all others, and the plane tilts.
+
+    12 k + 2 numbers; the first keyframe stays, and with it the world.  The tilt is the step that its events want, given that
+    every keyframe would follow (Schur's complement), and that it was `start`, more or less.
+    """
+    count = len(m.keyframes)
+    free = range(max(1, count - (last or count)), count)
+    found = {i: _placed(m, i, matching) for i in free}
+    matches = {i: one for i, one in found.items() if one is not None}
+    normal, push = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    for one in matches.values():
+        normal += one.normal
+        push += one.push
+    drift = (m.plane.across() @ (m.plane.normal - start.normal)[..., None])[0, :, 0] * m.focal  # px, from the first plane
+    certain = (1 / (math.pi / 180 * how.tilt * m.focal)) ** 2
+    doubt = how.doubt**2
+    tilt = -torch.linalg.solve(normal / doubt + certain * torch.eye(2, dtype=torch.float64), push / doubt + certain * drift)
+    tilt = tilt * (MOST_TILT * m.focal / tilt.norm().clamp_min(MOST_TILT * m.focal))
+    keyframes = list(m.keyframes)
+    for i, one in matches.items():
+        x = one.match.x[:, :SIZE] - one.pull @ tilt
+        keyframes[i] = keyframes[i].at(keyframes[i].state.moved(x * one.size[:, :SIZE]))
+    fresh = Map(m.plane.leaning(tilt[None] / m.focal), m.focal, m.border, m.texture, number=m.number)
+    for keyframe in keyframes:
+        fresh.draw(keyframe)
+    cost = sum(float(one.match.cost) for one in matches.values()) / max(1, len(matches))
+    return Settled(fresh, tilt / m.focal, cost)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A keyframe in the map of the others.  normal [2, 2], push [2]: what it says about the tilt | pull [12, 2]: how it follows."""
+
+    match: Match
+    size: Tensor
+    normal: Tensor
+    push: Tensor
+    pull: Tensor
+
+
+def _placed(m: Map, number: int, matching: Matching) -> _Placed | None:
+    task, keyframe = before_others(m, number, matching), m.keyframes[number]
+    if task is None:
+        return None
+    found = match(torch.zeros(1, SIZE, dtype=torch.float64), task, matching)
+    A, slope = (found.information + task.prior)[0], found.slope[0]
+    pull = torch.linalg.solve(A[:SIZE, :SIZE], A[:SIZE, SIZE:])
+    normal, push = A[SIZE:, SIZE:] - A[SIZE:, :SIZE] @ pull, slope[SIZE:] - pull.mT @ slope[:SIZE]
+    return _Placed(found, units(keyframe.state, m.plane, keyframe.seconds, m.focal), normal, push, pull)
+
+
+def before_others(m: Map, number: int, matching: Matching) -> Task | None:
+    """A keyframe before the map of all others; None where nothing of them is in its view."""
+    keyframe, own = m.keyframes[number], m.drawn(number)
+    if own is None:
+        return None
+    box, added = own
+    layers = m.assembled(box) - added
+    (chart,) = m.charts(layers, box, m.texture.blur[-1:])
+    area, H_k = Area(box, layers, (chart,)), m.warp(keyframe.state, keyframe.seconds)
+    few = m.trusted(keyframe.ink.thinned(matching.every), H_k, area)
+    if not few.weight.any():
+        return None
+    ghosts, ground = m.by_chance(few, chart, H_k, area)
+    loose = torch.tensor([LOOSE[0] ** -2] * 6 + [LOOSE[1] ** -2] * 6 + [0.0] * 2, dtype=torch.float64)
+    basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64)
+    return Task(keyframe.state, m.plane, keyframe.seconds, chart, few, keyframe.ink.sample(SOME), loose.diag()[None], basis, ghosts, ground)
