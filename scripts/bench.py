@@ -33,8 +33,8 @@ from torchcmax.core.estimate import Estimate, Search, estimate
 from torchcmax.core.model import MODELS, Planar
 from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.window import Window
+from torchcmax.folder import writing
 from torchcmax.io import DataNote, Recording, open
-from torchcmax.report import writing
 from torchcmax.simulator import Simulation, write
 
 Table = list[dict[str, object]]

@@ -18,8 +18,9 @@ from torchcmax.core.model import Displacement, Planar
 from torchcmax.core.objective import Look
 from torchcmax.core.pose import Motion
 from torchcmax.core.window import Window
+from torchcmax.folder import writing
 from torchcmax.io import Recording, open
-from torchcmax.report import captioned, pictures, writing
+from torchcmax.picture import captioned, pictures
 from torchcmax.simulator import Simulation, simulate
 
 THESIS = Look(polarity="signed", reference="first", tilt=0.0)

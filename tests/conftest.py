@@ -60,3 +60,13 @@ def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "poster"
     write(Simulation(duration=0.12), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """A simulated recording of a small sensor: half a second before a poster, six degrees of freedom."""
+    from torchcmax.simulator import Simulation, write
+
+    folder = tmp_path_factory.mktemp("small") / "poster"
+    write(Simulation(duration=0.5, width=120, height=90, focal=100), folder)
+    return folder

@@ -41,6 +41,7 @@ def test_every_command_and_snippet_runs(place):
                 continue  # the test below, and the run of the tests itself
             run(["bash", "-c", line.replace("torchcmax ", f"{sys.executable} -m torchcmax.cli ", 1)], place)
     assert len(list((place / "logs" / "compensated" / "images").glob("*.png"))) >= 1
+    assert (place / "logs" / "tracked" / "map.png").is_file()
     assert (place / "logs" / "thesis" / "figure_2_3.png").is_file()
 
 
@@ -59,10 +60,11 @@ def test_the_readme_begins_with_the_two_commands():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not OWN, reason="not in the environment that scripts/run makes")
-def test_the_first_command_ends_with_pictures():
+def test_the_first_command_ends_with_a_map_and_its_error():
     out = run(["scripts/run"], ROOT)
-    assert "done: look at the pictures in logs/demo/compensate/images" in out
-    assert list((ROOT / "logs/demo/compensate/images").glob("*.png"))
+    assert "done: look at the map, logs/demo/track/map.png" in out
+    assert "% of the plane's distance" in out
+    assert (ROOT / "logs/demo/track/map.png").is_file()
 
 
 def test_what_ci_runs_is_what_the_readme_says():

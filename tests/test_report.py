@@ -11,8 +11,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.core.camera import Canvas
 from torchcmax.core.warp import still
+from torchcmax.folder import COLUMNS, writing
 from torchcmax.io import DataError, open
-from torchcmax.report import COLUMNS, Report, captioned, coloured, pictures, png, rows, writing
+from torchcmax.picture import captioned, coloured, pictures, png
+from torchcmax.report import Report, rows
 
 HEADER = "index,start_us,end_us,events,contrast_zero,contrast,gain,omega_x,omega_y,omega_z,v_x,v_y,v_z,n_x,n_y,n_z,evaluations,converged"
 

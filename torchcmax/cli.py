@@ -1,4 +1,4 @@
-"""The command line: torchcmax simulate | info | compensate.  Exits 0 when all went well, 1 on bad data, 2 on wrong usage."""
+"""The command line: torchcmax simulate | info | compensate | track.  Exits 0 when all went well, 1 on bad data, 2 on wrong usage."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import os
 import re
 import sys
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 import yaml
@@ -23,6 +25,10 @@ from torchcmax.config import USAGE_ERROR, Parser, UsageError, command, parser, u
 from torchcmax.io import DataError, DataNote, DataWarning, OpenOptions, Recording, open, summary
 from torchcmax.report import Report
 from torchcmax.simulator import Simulation, write
+from torchcmax.slam.system import Slam
+from torchcmax.track import TrackOptions, Tracks, track
+from torchcmax.track import load_kernels as load_tracking
+from torchcmax.trackreport import TrackReport
 
 T = TypeVar("T")
 DATA_ERROR, INTERRUPTED = 1, 130
@@ -52,12 +58,25 @@ def build() -> Parser:
         "(motion at each window's first event, rad/s and plane distances/s), images/, summary.json and TensorBoard curves to --out."
     )
     _add_opening(compensating)
-    compensating.add_argument("--out", type=str, required=True, help="folder to write; look at it with: tensorboard --logdir DIR")
-    compensating.add_argument("--images", type=int, default=10, help="a picture of every so many windows; 0: none")
-    compensating.add_argument("--threads", type=int, default=0, help="of the CPU's kernels; 0: as many as this process may use")
-    compensating.add_argument("--quiet", action="store_true", help="no progress bar")
+    _add_running(compensating, images=10)
     compensating.add_class_arguments(Compensation)
     commands.add_subcommand("compensate", compensating, help="estimate the motion of every window, and show it")
+
+    tracking = command(
+        "Follow the camera before a plane, and map the plane on the way. Writes trajectory.txt (TUM: seconds, T_wc in plane distances or "
+        "metres), windows.csv, keyframes.csv, map.png, map.h5, images/, summary.json and TensorBoard curves to --out."
+    )
+    _add_opening(tracking)
+    _add_running(tracking, images=25)
+    tracking.add_argument(
+        "--from", type=float | None, default=None, help="second of the recording's clock to begin at; default: the first event"
+    )
+    tracking.add_argument(
+        "--to", type=float | None, default=None, help="second of the recording's clock to stop before; default: the last event"
+    )
+    tracking.add_class_arguments(TrackOptions, skip={"slam", "begin", "end"})
+    tracking.add_class_arguments(Slam)
+    commands.add_subcommand("track", tracking, help="follow the camera, and map the plane that it sees")
     return main
 
 
@@ -68,13 +87,21 @@ def _add_opening(command: Parser) -> None:
     command.add_class_arguments(OpenOptions, skip={"strict", "sensor", "chunk"})
 
 
+def _add_running(command: Parser, images: int) -> None:
+    command.add_argument("--out", type=str, required=True, help="folder to write; look at it with: tensorboard --logdir DIR")
+    command.add_argument("--images", type=int, default=images, help="a picture of every so many windows; 0: none")
+    command.add_argument("--threads", type=int, default=0, help="of the CPU's kernels; 0: as many as this process may use")
+    command.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; the exit status is returned."""
     torch.set_num_threads(1)  # what is left to torch is too little work for two: they would spin
     warnings.showwarning = _say
     top = build()
     config = top.parsed(arguments)
-    name, commands = config.command, {"simulate": run_simulate, "info": run_info, "compensate": run_compensate}
+    name = config.command
+    commands = {"simulate": run_simulate, "info": run_info, "compensate": run_compensate, "track": run_track}
     try:
         return commands[name](config[name])
     except UsageError as error:
@@ -87,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        print(f"\ntorchcmax {name}: stopped{'; what was finished is kept' if name == 'compensate' else ''}", file=sys.stderr)
+        print(f"\ntorchcmax {name}: stopped{'; what was finished is kept' if name in ('compensate', 'track') else ''}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -143,18 +170,9 @@ def run_info(config: Namespace) -> int:
 def run_compensate(config: Namespace) -> int:
     """torchcmax compensate"""
     options, out = _dataclass(Compensation, config), _folder(config.out)
-    check_device(options.device)
-    if config.images < 0:
-        raise UsageError(f"--images wants a number of at least 0, got {config.images}")
-    if config.threads < 0:
-        raise UsageError(f"--threads wants a number of at least 0, got {config.threads}")
-    kernels.set_threads(config.threads or available_cores())  # of this process, which is ours
-    recording = open(config.recording, _opening(config))
-    load_kernels(options.device)
-    settings = {name: config[name] for name in ("strict", "camera", "sensor", "images")} | dataclasses.asdict(options)
-    text = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
+    recording = _running(config, load_kernels)
     with (
-        Report(out, recording, options, text, config.images) as report,
+        Report(out, recording, options, _settings(config, options), config.images) as report,
         tqdm(total=expected(recording, options), unit="window", desc=recording.name, disable=config.quiet) as bar,
     ):
         for window, estimate in compensate(recording, options):
@@ -167,6 +185,75 @@ def run_compensate(config: Namespace) -> int:
         f"curves: tensorboard --logdir {report.folder}"
     )
     return 0
+
+
+def _running(config: Namespace, load: Callable[[str], None]) -> Recording:
+    """The recording to go through, with the kernels loaded."""
+    check_device(config.device)
+    for name in ("images", "threads"):
+        if config[name] < 0:
+            raise UsageError(f"--{name} wants a number of at least 0, got {config[name]}")
+    kernels.set_threads(config.threads or available_cores())  # of this process, which is ours
+    recording = open(config.recording, _opening(config))
+    load(config.device)
+    return recording
+
+
+def _settings(config: Namespace, options: Any, names: tuple[str, ...] = ()) -> str:
+    """The run's configuration as YAML, which --config makes the same run of."""
+    settings = {name: config[name] for name in ("strict", "camera", "sensor", "images", *names)} | dataclasses.asdict(options)
+    text: str = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False)
+    return text
+
+
+def run_track(config: Namespace) -> int:
+    """torchcmax track"""
+    slam, out = _dataclass(Slam, config), _folder(config.out)
+    with usage():
+        options = TrackOptions(slam, config["from"], config.to, config.distance, config.map, config.device)
+    recording = _running(config, partial(load_tracking, slam))
+    tracks = track(recording, options)
+    text = _settings(config, slam, ("from", "to", "distance", "map", "device"))
+    with tracks.stream, TrackReport(out, tracks, text, config.images) as report, Progress(tracks, report, config.quiet) as bar:
+        for one in tracks:
+            report.add(one)
+            bar.update()
+    print(f"{told(report)}\ntrajectory: {out / 'trajectory.txt'}\nmap: {out / 'map.png'}\ncurves: tensorboard --logdir {out}")
+    return 0
+
+
+def told(report: TrackReport) -> str:
+    """The run in a few words."""
+    found, error = report.summary(), report.error
+    words = f"{found['windows']} windows, {found['keyframes']} keyframes, {found['lost_seconds']:g} s lost, {report.factor:.2f}x real time"
+    if error is None:
+        return words
+    parts = [] if error["percent_of_distance"] is None else [f"{error['percent_of_distance']:.3f} % of the plane's distance"]
+    parts += [f"{error['orientation_rmse_deg']:.3f} degrees", f"coverage {error['coverage']:.3f}"]
+    return f"{words}\nerror: {', '.join(parts)}"
+
+
+class Progress:
+    """A bar of the recording's seconds, and how many of them a second of work takes."""
+
+    def __init__(self, tracks: Tracks, report: TrackReport, quiet: bool) -> None:
+        self._tracks, self._report = tracks, report
+        self._bar = tqdm(desc=tracks.recording.name, disable=quiet, bar_format="{desc}: {n:.2f} s [{elapsed}{postfix}]")
+
+    def update(self) -> None:
+        """Another window is done."""
+        stream, seconds = self._tracks.stream, self._report.seconds
+        if stream.share:
+            self._bar.bar_format = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
+            self._bar.total = seconds / (stream.share * self._report.events / stream.consumed)  # some were taken and are still to come
+        self._bar.set_postfix_str(f"{self._report.factor:.2f}x real time", refresh=False)
+        self._bar.update(seconds - self._bar.n)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
 
 
 def available_cores() -> int:
