@@ -30,7 +30,7 @@ def drawn(keyframes=3, seed=0):
         shift = torch.tensor([[0.4 * i, 0.1 * i, -0.05 * i]], dtype=torch.float64)
         pose = Pose(exp(torch.tensor([[0.01, 0.02, 0.3]], dtype=torch.float64) * i), shift)
         state = State(pose, Motion(torch.full((1, 3), 0.3, dtype=torch.float64), torch.full((1, 3), 2.0, dtype=torch.float64)))
-        m.draw(Keyframe(1_700_000_000_000_000 + 40_000 * i, state, torch.full((1,), 0.04, dtype=torch.float64), ink))
+        m.draw([Keyframe(1_700_000_000_000_000 + 40_000 * i, state, torch.full((1,), 0.04, dtype=torch.float64), ink)])
     assert len(m.keyframes) == keyframes
     return m
 
@@ -70,7 +70,7 @@ def test_a_map_comes_back_bit_for_bit(file):
 def test_what_comes_back_is_the_same_map_to_look_at_and_can_grow(file):
     m, back = drawn(), load_map(file)
     torch.testing.assert_close(back.strength(back.assembled(back.whole())), m.strength(m.assembled(m.whole())), rtol=0, atol=0)
-    back.draw(m.keyframes[0])
+    back.draw(m.keyframes[:1])
     assert len(back.keyframes) == 4
 
 

@@ -1,8 +1,9 @@
 import pytest
 import torch
 
+from torchcmax import kernels
 from torchcmax.core.camera import Canvas
-from torchcmax.core.draw import Ink, draw, draw_twin
+from torchcmax.core.draw import Ink, draw, draw_sum, draw_twin
 from torchcmax.core.warp import polynomial
 from torchcmax.core.window import Window
 
@@ -71,3 +72,74 @@ def test_events_behind_the_camera_are_left_out_without_nan(window, device):
         (gradient,) = torch.autograd.grad(image.sum(), H)
         assert (image == 0).all()
         assert gradient.isfinite().all()
+
+
+def test_joined_ink_draws_what_its_parts_draw(window, H_k, device):
+    ink = Ink.of(window, window.polarity)
+    parts = [Ink(*(part[i : i + 1, :n] for part in (ink.x, ink.y, ink.s, ink.weight))) for i, n in enumerate((70, 20, 45))]
+    joined, owner = Ink.join(parts), torch.arange(3, device=device)
+    assert joined.x.shape == (3, 70)
+    for i, n in enumerate((70, 20, 45)):
+        assert (joined.weight[i, n:] == 0).all()
+        assert torch.equal(joined.weight[i, :n], parts[i].weight[0])
+    together = draw(H_k[:3], joined, CANVAS, owner)
+    for i, part in enumerate(parts):
+        alone = draw(H_k[i : i + 1], part, CANVAS, owner[:1])[0]
+        torch.testing.assert_close(together[i], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_thinned_ink_is_every_so_manieth_event(window):
+    ink = Ink.of(window, window.weight)
+    assert ink.thinned(1) is ink
+    assert torch.equal(ink.thinned(4).s, ink.s[:, ::4])
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Switches the kernels off from here on."""
+    return lambda: monkeypatch.setenv(kernels.SWITCH, "0")
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_sum_of_drawings_is_one_drawing_of_all(window, H_k, rand, dtype, device, plain, compiled):
+    if not compiled:
+        plain()
+    tolerance = {torch.float32: {"rtol": 1e-3, "atol": 1e-3}, torch.float64: {"rtol": 1e-9, "atol": 1e-9}}[dtype]
+    ink, back, results = Ink.of(window, window.polarity), rand(1, *CANVAS.size), []
+    for how in (draw_sum, lambda *args: draw(*args, torch.arange(3, device=device)).sum(0, keepdim=True)):
+        H = H_k[:3].clone().requires_grad_()
+        image = how(H, ink, CANVAS)
+        assert image.shape == (1, *CANVAS.size)
+        results.append((image, torch.autograd.grad((image * back).sum(), H)[0]))
+    for one, many in zip(*results, strict=True):
+        torch.testing.assert_close(one, many, **tolerance)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_gradient_of_the_sum_is_that_of_central_differences(window, H_k, rand, threads, monkeypatch):
+    """Where the image is weighed by a plane the vote has no kinks: it is c + a x + b y of every event that is inside."""
+    window = window.to("cpu", torch.float64)
+    monkeypatch.setattr(pytest.importorskip("torchcmax.kernels.cpu"), "PART", 50)  # so that two threads share the windows
+    kernels.set_threads(threads)
+    ink, H = Ink.of(window, window.weight), H_k[:3].cpu().double().requires_grad_()
+    y, x = torch.meshgrid(torch.arange(25).double(), torch.arange(32).double(), indexing="ij")
+    back = 0.3 + 0.2 * x - 0.1 * y
+    wide = Canvas(5.0, CANVAS.centre, CANVAS.size)  # all events are inside
+
+    def weighed(H):
+        return (draw_sum(H, ink, wide)[0] * back).sum()
+
+    assert draw_sum(H, ink, wide).sum().item() == pytest.approx(ink.weight.sum().item())
+    (gradient,) = torch.autograd.grad(weighed(H), H)
+    h, flat = 1e-6, torch.zeros(H.numel(), dtype=torch.float64)
+    for i in range(0, H.numel(), 7):
+        side = flat.clone()
+        side[i] = h
+        side = side.view_as(H)
+        difference = (weighed(H + side) - weighed(H - side)) / (2 * h)
+        assert gradient.flatten()[i].item() == pytest.approx(difference.item(), rel=1e-6, abs=1e-6)
+
+
+def test_a_sum_wants_a_homography_for_each_window(window, H_k):
+    with pytest.raises(ValueError, match=r"draw_sum wants H_k \[W, K, 3, 3\] for ink of 3 windows, got \[5, 6, 3, 3\]"):
+        draw_sum(H_k, Ink.of(window, window.weight), CANVAS)

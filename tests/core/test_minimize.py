@@ -234,3 +234,40 @@ def test_a_round_waits_once_for_a_gpu(problem):
         minimize(rosenbrock, torch.tensor([[-1.2, 1.0]], dtype=torch.float64), stop=Stop(iterations=3))
     assert spared == len(calls)  # whose rows go on; after the first evaluation too
     assert waits.count > spared
+
+
+def test_with_the_inverse_hessian_a_quadratic_takes_one_step(problem):
+    """It is evaluated where it begins and where it ends, whatever lengths are measured by."""
+    A, centre = problem
+    found = minimize(quadratic(A, centre), torch.zeros_like(centre), stop=EXACT, inverse=torch.linalg.inv(A))
+    torch.testing.assert_close(found.x, centre, rtol=0, atol=1e-9)
+    assert (found.evaluations <= 2).all()
+    assert (found.iterations == 1).all()
+    assert found.converged.all()
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_an_inverse_of_the_wrong_scale_is_mended_on_the_way(problem, factor):
+    A, centre = problem
+    inverse = factor * torch.linalg.inv(A)
+    kept = inverse.clone()
+    found = minimize(quadratic(A, centre), torch.zeros_like(centre), A, EXACT, inverse)
+    torch.testing.assert_close(found.x, centre, rtol=0, atol=1e-5)
+    assert torch.equal(inverse, kept)
+    assert found.converged.all()
+    assert (found.evaluations <= 12).all()
+
+
+def test_an_inverse_does_not_lengthen_the_longest_step(problem):
+    A, centre = problem
+    points, inner = [], quadratic(A[:1], 100 * centre[:1])
+
+    def watching(x, rows):
+        points.append(x[0].clone())
+        return inner(x, rows)
+
+    start = torch.zeros(1, 5, dtype=torch.float64)
+    found = minimize(watching, start, stop=Stop(longest=3.0, iterations=4), inverse=torch.linalg.inv(A[:1]))
+    assert (torch.stack(points).diff(dim=0).norm(dim=-1) <= 3.0 + 1e-9).all()
+    assert found.iterations[0] == 4
+    assert (found.trace[0].diff() <= 0).all()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchcmax.core import so3
 from torchcmax.core.camera import NEAREST, Canvas
-from torchcmax.core.contrast import CONTRASTS, blur
+from torchcmax.core.contrast import CONTRASTS, blur, normalized
 from torchcmax.core.draw import Ink, draw_sum
 from torchcmax.core.minimize import Stop, minimize
 from torchcmax.core.plane import Plane
@@ -37,6 +37,10 @@ class Joint:
     """Factor by which an area may change, against the start, before the guard against collapse speaks."""
     guard: float = 10.0
     """Weight of that guard, in log contrast per (log area)^2."""
+    acceleration: tuple[float, float] = (20.0, 8.0)
+    """What the motion may change by from window to window: rad/s^2 and plane distances/s^2, one sigma."""
+    steady: float = 0.03
+    """Weight of such changes, in log contrast per square of a sigma: it decides where the windows do not."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ def halves(motion: Motion, seconds: Tensor) -> tuple[Pose, Pose]:
 def products(steps: Pose) -> Pose:
     """Poses after no step, the first, the first two, ...: steps [F - 1] -> [F].  Each round doubles how many are multiplied."""
     eye = torch.eye(3, dtype=steps.R.dtype, device=steps.R.device)
-    R, t = torch.cat([eye[None], steps.R]), torch.cat([torch.zeros_like(steps.t[:1]), steps.t])
+    R, t = torch.cat([eye[None], steps.R]), torch.cat([steps.t.new_zeros(1, 3), steps.t])
     reach = 1
     while reach < len(R):
         grown = Pose(R[:-reach], t[:-reach]) @ Pose(R[reach:], t[reach:])
@@ -144,9 +148,17 @@ class Common:
         """-log contrast + guard."""
         states, plane = self.at(y)
         H_k = onto(states, plane, self.frames.seconds, self.eye)
-        image = draw_sum(H_k.to(self.frames.ink.x), self.frames.ink, self.canvas)
+        ink = self.frames.ink
+        image = normalized(draw_sum(H_k.to(ink.x), ink, self.canvas), ink.weight.reshape(1, -1))  # so that canvases compare
         contrast = CONTRASTS[self.how.contrast](blur(image, self.how.sigma))[0]
-        return self.strain(H_k, states, plane) - contrast.to(y).log()
+        return self.strain(H_k, states, plane) + self.jerk(states.motion) - contrast.to(y).log()
+
+    def jerk(self, motion: Motion) -> Tensor:
+        """How much the motion changes from window to window, as a share of what it may; 0 for a single window."""
+        between = (self.frames.seconds[1:] + self.frames.seconds[:-1])[:, None] / 2
+        pairs = zip((motion.omega, motion.velocity), self.how.acceleration, strict=True)
+        changes = [(part.diff(dim=0) / (sigma * between)).square().sum() for part, sigma in pairs]
+        return self.how.steady * (changes[0] + changes[1]) / max(1, 6 * len(between))
 
     def strain(self, H_k: Tensor, states: State, plane: Plane) -> Tensor:
         """The guard against collapse: how areas change against the start."""

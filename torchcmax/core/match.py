@@ -37,7 +37,7 @@ class Matching:
     """full: pose and motion; motion: angular velocity and velocity alone, from the pose at the window's start, as in the thesis."""
     weight: float = 0.3
     """Of one event against the prior: information of T - T^2/2; neighbouring events are not independent."""
-    every: int = 4
+    every: int = 2
     """Every so-manieth event is looked up, with as much more weight."""
     stop: Stop = field(default_factory=lambda: Stop(tolerance=0.02, iterations=12, longest=5.0))
     """When it is done, px of the events' motion on the map."""

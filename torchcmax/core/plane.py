@@ -33,6 +33,10 @@ class Plane:
         w = torch.cat([tilt, torch.zeros_like(tilt[:, :1])], -1)
         return cls(-so3.exp(w)[..., 2], torch.ones_like(tilt[:, 0]))
 
+    def repeated(self, count: int) -> Plane:
+        """The plane [1] for so many cameras."""
+        return Plane(self.normal.expand(count, 3), self.distance.expand(count))
+
     def tilt(self) -> Tensor:
         """The two angles that `tilted` wants for this normal: -> [B, 2] rad."""
         x, y, z = self.normal.double().unbind(-1)  # atan2 of float32 rounds differently in another batch

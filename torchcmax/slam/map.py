@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -62,6 +63,15 @@ class Area:
     charts: tuple[Chart, ...]
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What a keyframe added to a map: its warp H_k [K, 3, 3], where, and the layers."""
+
+    H_k: Tensor
+    box: Box
+    layers: Layers
+
+
 @dataclass
 class Map:
     """plane [1] | focal px per plane distance | border [M, 3] float32 rays around the sensor's edge
@@ -79,7 +89,7 @@ class Map:
     number: int = 0
     _area: Area | None = field(default=None, repr=False)
     _sums: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict, repr=False)
-    _drawn: dict[int, tuple[Box, Layers]] = field(default_factory=dict, repr=False)
+    _drawn: dict[int, Drawn] = field(default_factory=dict, repr=False)
 
     @cached_property
     def view(self) -> Tensor:
@@ -157,18 +167,25 @@ class Map:
         first, second = (sum(sums[i] for sums in self._sums.values()) for i in (0, 1))
         return second / first if first > 0 else 0.0
 
-    def draw(self, keyframe: Keyframe) -> None:
-        """Add a window, and tiles for it where there are none."""
-        H_k = self.warp(keyframe.state, keyframe.seconds)
-        box = self.box(H_k)
-        self.keyframes.append(keyframe)
-        if box is None:
-            return
-        added = self.layers_of(keyframe, H_k, box)
-        self._drawn[len(self.keyframes) - 1] = box, added
-        self._drawn.pop(len(self.keyframes) - 1 - KEPT, None)
+    def draw(self, keyframes: Sequence[Keyframe]) -> None:
+        """Add windows, and tiles for them where there are none."""
+        seconds = torch.cat([k.seconds for k in keyframes])
+        warps = State.join([k.state for k in keyframes]).homography(self.plane.repeated(len(keyframes)), seconds, self.view)
+        for keyframe, H_k in zip(keyframes, warps, strict=True):
+            self.keyframes.append(keyframe)
+            box = self.box(H_k)
+            if box is not None:
+                self._add(Drawn(H_k, box, self.layers_of(keyframe, H_k, box)))
+        self._area = None
+
+    def _add(self, drawn: Drawn) -> None:
+        box, added, newest = drawn.box, drawn.layers, len(self.keyframes) - 1
+        self._drawn[newest] = drawn
+        self._drawn.pop(newest - KEPT, None)
         votes, exposure = apart(added.votes, box), apart(added.exposure, box)
         seen = exposure.flatten(1).any(1).tolist()
+        if not any(seen):  # nothing moved
+            return
         for name, hit in zip(box.tiles(), seen, strict=True):
             if hit and name not in self.tiles:
                 self.tiles[name] = Layers(torch.zeros_like(self._empty.votes), torch.zeros_like(self._empty.exposure))
@@ -177,16 +194,15 @@ class Map:
         names = [(i, name) for i, (name, hit) in enumerate(zip(box.tiles(), seen, strict=True)) if hit]
         torch._foreach_add_([self.tiles[name].votes for _, name in names], [votes[i] for i, _ in names])
         torch._foreach_add_([self.tiles[name].exposure for _, name in names], [exposure[i] for i, _ in names])
-        self._area = None
 
-    def drawn(self, number: int) -> tuple[Box, Layers] | None:
+    def drawn(self, number: int) -> Drawn | None:
         """What a keyframe added, and where; None where it looks along the plane."""
         if number in self._drawn:
             return self._drawn[number]
         keyframe = self.keyframes[number]
         H_k = self.warp(keyframe.state, keyframe.seconds)
         box = self.box(H_k)
-        return None if box is None else (box, self.layers_of(keyframe, H_k, box))
+        return None if box is None else Drawn(H_k, box, self.layers_of(keyframe, H_k, box))
 
     def layers_of(self, keyframe: Keyframe, H_k: Tensor, box: Box) -> Layers:
         """What a window adds to these tiles."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchcmax.core.draw import Ink
 from torchcmax.core.joint import Frames, Joint, Solved, optimize_chain
 from torchcmax.core.match import NUMBERS, Match, Matching, Task, match, units
+from torchcmax.core.model import Displacement
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import SIZE, State
@@ -19,6 +20,7 @@ from torchcmax.core.window import Window
 from torchcmax.slam.map import Area, Map
 from torchcmax.slam.tracker import SOME
 
+RIVAL = 4  # every so-manieth event is enough to tell the twin plane
 MOST_TILT = 0.05  # rad in a round
 LOOSE = 5.0, 2.0  # px: how far the pose and the motion of a keyframe go in a round, one sigma
 
@@ -37,9 +39,9 @@ class Mapping:
     """Rounds of joint optimization of the first keyframes."""
     overlap: float = 0.8
     """A window of which less is known becomes a keyframe."""
-    every: int = 4
+    every: int = 8
     """Keyframes from one joint optimization to the next."""
-    last: int = 10
+    last: int = 12
     """Keyframes that are optimized at a time."""
     until: int = 30
     """New keyframes after which the joint optimization waits for the end."""
@@ -56,18 +58,34 @@ def thinned(ink: Ink, most: int) -> Ink:
     return ink.thinned(max(1, -(-ink.x.shape[-1] // most)))
 
 
-def first_plane(windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, tilt: Tensor) -> Solved:
+def first_plane(windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, tilt: Tensor | None = None) -> Solved:
     """Consecutive windows before one plane, from their own motions [1] before a wall: all motions and the plane together.
 
-    tilt [1, 2] rad: the plane to start from
+    One window has two planes that explain it as well, the second being the first's velocity (Displacement.twin).  So from the
+    twin of what was found the search is begun once more, with a few of the events; where that ends sharper, it is the plane.
+    tilt [1, 2] rad: the plane to start from; default: the wall
     """
-    wall = Plane.tilted(tilt)
+    start = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64) if tilt is None else tilt)
     count, middle = len(windows), len(windows) // 2
     inks = Ink.join([thinned(Ink.of(w, w.weight), how.thinned) for w in windows])
     seconds = torch.cat([w.duration for w in windows]).double()
     motion = Motion(torch.cat([m.omega for m in motions]), torch.cat([m.velocity for m in motions]))
     rest = Pose(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), torch.zeros(count, 3, dtype=torch.float64))
-    return optimize_chain(Frames(State(rest, motion), seconds, inks, wall), focal, how.joint, middle)
+    frames = Frames(State(rest, motion), seconds, inks, start)
+    found = optimize_chain(frames, focal, how.joint, middle)
+    few = inks.thinned(RIVAL)
+    rival = optimize_chain(replace(frames, ink=few, plane=twin_of(found.frames, middle)), focal, how.joint, middle)
+    if rival.contrast > optimize_chain(replace(found.frames, ink=few), focal, how.joint, middle).contrast:
+        found = optimize_chain(replace(rival.frames, ink=inks), focal, how.joint, middle)
+    return found
+
+
+def twin_of(frames: Frames, middle: int) -> Plane:
+    """The other plane [1] that explains the middle window."""
+    state, seconds = frames.state[middle : middle + 1], frames.seconds[middle : middle + 1, None]
+    there = state.seen(frames.plane)
+    shift = state.motion.velocity * seconds / there.distance[:, None]
+    return Plane(Displacement(state.motion.omega * seconds, shift, there.normal).twin().normal, frames.plane.distance)
 
 
 def rebased(frames: Frames) -> Frames:
@@ -114,8 +132,7 @@ def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | 
         x = one.match.x[:, :SIZE] - one.pull @ tilt
         keyframes[i] = keyframes[i].at(keyframes[i].state.moved(x * one.size[:, :SIZE]))
     fresh = Map(m.plane.leaning(tilt[None] / m.focal), m.focal, m.border, m.texture, number=m.number)
-    for keyframe in keyframes:
-        fresh.draw(keyframe)
+    fresh.draw(keyframes)
     cost = sum(float(one.match.cost) for one in matches.values()) / max(1, len(matches))
     return Settled(fresh, tilt / m.focal, cost)
 
@@ -147,10 +164,9 @@ def before_others(m: Map, number: int, matching: Matching) -> Task | None:
     keyframe, own = m.keyframes[number], m.drawn(number)
     if own is None:
         return None
-    box, added = own
-    layers = m.assembled(box) - added
-    (chart,) = m.charts(layers, box, m.texture.blur[-1:])
-    area, H_k = Area(box, layers, (chart,)), m.warp(keyframe.state, keyframe.seconds)
+    layers, H_k = m.assembled(own.box) - own.layers, own.H_k
+    (chart,) = m.charts(layers, own.box, m.texture.blur[-1:])
+    area = Area(own.box, layers, (chart,))
     few = m.trusted(keyframe.ink.thinned(matching.every), H_k, area)
     if not few.weight.any():
         return None

@@ -172,13 +172,12 @@ class _Run:
         """The first windows, together, make the first plane and map."""
         self.source = source
         windows, fronts = self._first_windows()
-        if len(windows) < 2:
+        if len(windows) < min(2, self.options.mapping.first):
             raise TooShort(f"recording {self.number} holds too few events to begin: {len(windows)} windows, at least 2 are wanted")
         if self.given is not None:
             yield from self._on_map(windows, fronts)
             return
-        wall = torch.zeros(1, 2, dtype=torch.float64)
-        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, self.options.mapping, wall).frames)
+        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, self.options.mapping).frames)
         self.start_plane = solved.plane
         self._map = Map(solved.plane, self.canvas.focal, self.border, self.options.texture, number=self.number)
         for i, window in enumerate(windows):
@@ -282,7 +281,7 @@ class _Run:
 
     def _draw(self, window: Window, state: State) -> None:
         keyframe = Keyframe(int(middle_of(window)[0]), state, window.duration.double(), Ink.of(window, window.weight))
-        self.map.draw(keyframe)
+        self.map.draw([keyframe])
 
     def _optimize(self) -> None:
         """A joint optimization after every few new keyframes, while the map is young."""

@@ -1,0 +1,347 @@
+"""A window before the texture of a map: what its events look up, the slopes of that, and where it comes to rest."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchcmax import kernels
+from torchcmax.core import so3
+from torchcmax.core.camera import Canvas
+from torchcmax.core.contrast import blur, variance
+from torchcmax.core.draw import Ink, draw
+from torchcmax.core.match import (
+    LEAST,
+    NUMBERS,
+    Chart,
+    Matching,
+    Task,
+    curvature,
+    descend,
+    evaluate,
+    gram,
+    homography,
+    lookup,
+    match,
+    sharpen,
+    units,
+)
+from torchcmax.core.minimize import Stop
+from torchcmax.core.objective import RIDGE
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Motion, Pose
+from torchcmax.core.state import SIZE, State
+from torchcmax.core.warp import still
+
+DOUBLE, FOCAL, HEIGHT, WIDTH = torch.float64, 90.0, 100, 120
+EXACT = Matching(stop=Stop(tolerance=2e-3, iterations=60, longest=5.0), every=1)  # bilinear kinks forbid more
+BASIS = torch.eye(NUMBERS, SIZE, dtype=DOUBLE)
+
+
+def rand(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=DOUBLE)
+
+
+def curves(count, seed):
+    """Places on a circle, a slanted line and a wave: [count, 2] px."""
+    a, which = 2 * math.pi * rand(count, seed=seed), torch.arange(count) % 3
+    x = torch.stack([60 + 24 * a.cos(), 20 + 12 * a, 18 + 13.5 * a], -1)
+    y = torch.stack([50 + 28 * a.sin(), 80 - 9 * a, 45 + 22 * a.cos()], -1)
+    return torch.stack([part.gather(1, which[:, None])[:, 0] for part in (x, y)], -1)
+
+
+def world(windows=2, count=900, seed=0):
+    """Cameras that turn and move before a tilted plane with curves on it: truth, plane, seconds, chart, ink."""
+    pose = Pose(so3.exp(0.1 * (rand(windows, 3, seed=seed) - 0.5)), 0.2 * (rand(windows, 3, seed=seed + 1) - 0.5))
+    truth = State(pose, Motion(2 * (rand(windows, 3, seed=seed + 2) - 0.5), rand(windows, 3, seed=seed + 3) - 0.5))
+    plane = Plane(Plane.tilted(torch.tensor([[0.2, -0.15]], dtype=DOUBLE)).normal, torch.tensor([1.3], dtype=DOUBLE)).repeated(windows)
+    seconds = 0.04 + 0.02 * rand(windows, seed=seed + 4)
+    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    away = torch.cdist(torch.stack([x, y], -1).flatten(0, 1), curves(4000, seed=99)).amin(-1).view(1, HEIGHT, WIDTH)
+    texture = 0.95 * (-(away**2) / 8).exp()
+    corner = torch.tensor([[-61.5, -53.25]], dtype=DOUBLE).expand(windows, 2)
+    chart = Chart(texture.expand(windows, -1, -1), corner, plane.facing(), FOCAL)
+    s = rand(windows, count, seed=seed + 5).sort(-1).values - 0.5
+    H_k = homography(torch.zeros(windows, NUMBERS, dtype=DOUBLE), truth, plane, seconds, chart)
+    H = sum(H_k[:, None, k] * s[..., None, None] ** k for k in range(H_k.shape[1]))
+    place = torch.stack([curves(count, seed=seed + 6 + i) for i in range(windows)]) / FOCAL
+    ray = torch.linalg.solve(H, torch.cat([place, torch.ones_like(place[..., :1])], -1)[..., None])[..., 0]
+    return truth, plane, seconds, chart, Ink(ray[..., 0] / ray[..., 2], ray[..., 1] / ray[..., 2], s, torch.ones_like(s))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return world()
+
+
+def problem_of(scene, off=0.0, seed=20):
+    """The scene, from a prediction that is `off` px from the truth: predicted, plane, seconds, chart, ink."""
+    truth, plane, seconds, chart, ink = scene
+    step = 2 * off * (rand(len(seconds), SIZE, seed=seed) - 0.5) * units(truth, plane, seconds, FOCAL)[:, :SIZE]
+    return truth.moved(step), plane, seconds, chart, ink
+
+
+def task_of(scene, off=0.0, certain=1e-3, basis=BASIS, **more):
+    predicted, plane, seconds, chart, ink = problem_of(scene, off)
+    prior = (certain * torch.eye(NUMBERS, dtype=DOUBLE)).expand(len(seconds), -1, -1)
+    return Task(predicted, plane, seconds, chart, ink, ink.sample(40), prior, basis, **more)
+
+
+def apart(scene, task, found):
+    """px between where the events are found to lie on the map and where they do: rms of each window."""
+    there = homography(torch.zeros_like(found.x), scene[0], task.plane, task.seconds, task.chart)
+    here = homography(found.x, task.predicted, task.plane, task.seconds, task.chart)
+    return (places(here, task.ink) - places(there, task.ink)).square().sum(-1).mean(-1).sqrt()
+
+
+def places(H_k, ink):
+    H = sum(H_k[:, None, k] * ink.s[..., None, None] ** k for k in range(H_k.shape[1]))
+    ray = (H @ ink.ray.mT[..., None])[..., 0]
+    return FOCAL * ray[..., :2] / ray[..., 2:]
+
+
+def central(f, x, h=1e-7):
+    """df/dx [B, P] of numbers [B] at x [B, P]; so near that hardly an event crosses a kink of the bilinear lookup."""
+    sides = h * torch.eye(x.shape[1], dtype=x.dtype)
+    return torch.stack([(f(x + side) - f(x - side)) / (2 * h) for side in sides], -1)
+
+
+def test_a_lookup_by_hand():
+    """Value, slope along x, slope along y in the picture 1 2 / 3 4, and where half of the four pixels are missing."""
+    texture = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]], dtype=DOUBLE)
+    by_hand = {
+        (0.0, 0.0): (1.0, 1.0, 2.0),
+        (0.5, 0.5): (2.5, 1.0, 2.0),
+        (0.25, 0.75): (2.75, 1.0, 2.0),
+        (-0.5, 0.0): (0.5, 1.0, 1.0),
+        (0.0, -0.25): (0.75, 0.75, 1.0),
+        (1.5, 0.0): (1.0, -2.0, 1.0),
+        (1.75, 1.75): (0.25, -1.0, -1.0),
+    }
+    strength, slope = lookup(texture, torch.tensor([list(by_hand)], dtype=DOUBLE))
+    expected = torch.tensor(list(by_hand.values()), dtype=DOUBLE)
+    torch.testing.assert_close(strength[0], expected[:, 0])
+    torch.testing.assert_close(slope[0], expected[:, 1:])
+
+
+@pytest.mark.parametrize("place", [(-1.0, 0.5), (2.0, 0.5), (0.5, -1.0), (0.5, 2.0), (1e9, 0), (-1e30, 0), (math.nan, 0.5), (0, math.inf)])
+def test_nothing_is_found_outside(place):
+    strength, slope = lookup(torch.ones(1, 2, 2, dtype=DOUBLE), torch.tensor([[place]], dtype=DOUBLE))
+    assert strength.tolist() == [[0]]
+    assert slope.tolist() == [[[0, 0]]]
+
+
+def test_a_lookup_is_what_grid_sample_finds_and_its_slope_that_of_autograd():
+    texture, xy = rand(2, 9, 14), (rand(2, 300, 2, seed=1) * torch.tensor([18, 13], dtype=DOUBLE) - 2).requires_grad_()
+    grid = xy * torch.tensor([2 / 13, 2 / 8], dtype=DOUBLE) - 1
+    expected = torch.nn.functional.grid_sample(texture[:, None], grid[:, None], padding_mode="zeros", align_corners=True)[:, 0, 0]
+    (expected_slope,) = torch.autograd.grad(expected.sum(), xy)
+    strength, slope = lookup(texture, xy.detach())
+    torch.testing.assert_close(strength, expected.detach(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(slope, expected_slope, rtol=0, atol=1e-12)
+
+
+def test_at_the_truth_the_events_lie_on_the_edges(scene):
+    x = torch.zeros(2, NUMBERS, dtype=DOUBLE)
+    count = scene[-1].x.shape[1]
+    there = evaluate(x, *scene)[2] / count
+    assert (there > 0.3).all()
+    assert (evaluate(x + 4.0, *scene)[2] / count < 0.6 * there).all()
+
+
+def test_a_step_of_a_unit_moves_the_image_by_about_a_pixel(scene):
+    still_there = places(homography(torch.zeros(2, NUMBERS, dtype=DOUBLE), *scene[:4]), scene[4])
+    for p in range(SIZE):
+        x = torch.zeros(2, NUMBERS, dtype=DOUBLE)
+        x[:, p] = 1.0
+        rms = (places(homography(x, *scene[:4]), scene[4]) - still_there).square().sum(-1).mean(-1).sqrt()
+        assert (rms > 0.05).all()
+        assert (rms < 2).all()
+
+
+def test_the_slope_of_the_match_is_that_of_central_differences(scene):
+    problem, x = problem_of(scene, off=1.0), rand(2, NUMBERS, seed=30) - 0.5
+    value, gradient, found = evaluate(x, *problem)
+    torch.testing.assert_close(gradient, central(lambda x: evaluate(x, *problem)[0], x), rtol=1e-4, atol=1e-4)
+    assert (value < 0).all()
+    assert (found > -value).all()  # T is more than T - T^2/2
+
+
+def test_one_event_by_hand():
+    """On an edge of strength T it is worth T^2/2 - T; padded, outside or behind the camera it is worth nothing."""
+    rest = torch.zeros(4, 3, dtype=DOUBLE)
+    eye = torch.eye(3, dtype=DOUBLE).expand(4, 3, 3)
+    wall, state = Plane.tilted(rest[:, :2]), State(Pose(eye, rest), Motion(rest, rest))
+    texture = torch.zeros(4, 5, 5, dtype=DOUBLE)
+    texture[:, 2, 3] = 0.8
+    chart = Chart(texture, torch.full((4, 2), -2.0, dtype=DOUBLE), eye, 10.0)
+    ink = Ink(*(torch.tensor(part, dtype=DOUBLE)[:, None] for part in ([0.05, 0.05, 5.0, 0.05], [0.0] * 4, [0.0] * 4, [1.0, 0, 1, 1])))
+    state = State(Pose(torch.cat([eye[:3], -eye[:1]]), rest), state.motion)  # the last looks the other way
+    value, gradient, found = evaluate(torch.zeros(4, NUMBERS, dtype=DOUBLE), state, wall, torch.ones(4, dtype=DOUBLE), chart, ink)
+    torch.testing.assert_close(value, torch.tensor([0.4**2 / 2 - 0.4, 0, 0, 0], dtype=DOUBLE))
+    torch.testing.assert_close(found, torch.tensor([0.4, 0, 0, 0], dtype=DOUBLE))
+    assert gradient[0, 3].item() == pytest.approx((0.4 - 1) * 0.8)  # a shift to the right by one px
+    assert (gradient[1:] == 0).all()
+
+
+def test_the_curvature_is_that_of_each_event_by_itself(scene):
+    """J^T J / (T + LEAST), J by central differences of what single events find."""
+    predicted, plane, seconds, chart, ink = problem_of(scene, off=1.0)
+    many = torch.zeros(50, dtype=torch.int64)
+    alone = Ink(*(getattr(ink, n)[0, :50, None] for n in ("x", "y", "s", "weight")))
+    x = rand(1, NUMBERS, seed=30) - 0.5
+
+    def before(rows):
+        there = Plane(plane.normal[rows], plane.distance[rows])
+        return predicted[rows], there, seconds[rows], Chart(chart.texture[rows], chart.corner[rows], chart.view[rows], FOCAL)
+
+    T = evaluate(x.expand(50, -1), *before(many), alone)[2]
+    g = central(lambda x: evaluate(x, *before(many), alone)[2], x.expand(50, -1))
+    some = Ink(*(getattr(ink, n)[:1, :50] for n in ("x", "y", "s", "weight")))
+    found = curvature(x, *before(many[:1]), some)[0]
+    torch.testing.assert_close(found, (g.mT / (T + LEAST)) @ g, rtol=1e-4, atol=1e-4)
+
+
+def test_the_curvature_is_symmetric_and_never_negative(scene):
+    for off in (0.0, 3.0):
+        A = curvature(torch.zeros(2, NUMBERS, dtype=DOUBLE), *problem_of(scene, off))
+        torch.testing.assert_close(A, A.mT)
+        eigenvalues = torch.linalg.eigvalsh(A)
+        assert (eigenvalues >= -1e-9 * eigenvalues[:, -1:]).all()
+
+
+def test_the_metric_measures_how_far_a_step_moves_the_events(scene):
+    problem, some, x = problem_of(scene)[:4], scene[4].sample(60), rand(2, NUMBERS, seed=30) - 0.5
+    G = gram(x, *problem, some)
+    ridge = RIDGE * G.diagonal(dim1=1, dim2=2).mean(-1)[:, None, None] / (1 + RIDGE) * torch.eye(NUMBERS)
+    step = 1e-3 * (rand(2, NUMBERS, seed=31) - 0.5)
+    rms = (places(homography(x + step, *problem), some) - places(homography(x, *problem), some)).square().sum(-1).mean(-1).sqrt()
+    length = (step[:, None] @ (G - ridge) @ step[..., None])[:, 0, 0].sqrt()
+    torch.testing.assert_close(length, rms, rtol=1e-3, atol=0)
+    assert (torch.linalg.eigvalsh(G) > 0).all()
+
+
+def haunted(scene):
+    """Ghosts of different weights, and a smooth ground for them."""
+    place, s = 1.2 * (rand(2, 80, 2, seed=40) - 0.5), rand(2, 80, seed=41) - 0.5
+    y, x = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    ground = (0.3 + 0.1 * (x / 17).sin() * (y / 13).cos()).expand(2, -1, -1)
+    return {"ghosts": Ink(place[..., 0], place[..., 1], s, 0.5 + rand(2, 80, seed=42)), "ground": ground}
+
+
+def test_the_slope_of_the_cost_is_that_of_central_differences(scene):
+    x = rand(2, NUMBERS, seed=30) - 0.5
+    for more in ({}, haunted(scene)):
+        task = task_of(scene, off=1.0, certain=0.7, **more)
+        _, slope, _ = task.cost(x, 1.5)
+        torch.testing.assert_close(slope, central(lambda x, task=task: task.cost(x, 1.5)[0], x), rtol=1e-4, atol=2e-4)
+
+
+def test_the_cost_is_that_of_its_parts(scene):
+    """Events and ghosts by the weight, the prior by itself; ghosts one by one, as what they would bring in vain."""
+    x, more = rand(2, NUMBERS, seed=30) - 0.5, haunted(scene)
+    plain, task = task_of(scene, off=1.0, certain=0.7), task_of(scene, off=1.0, certain=0.7, **more)
+    events = evaluate(x, *problem_of(scene, off=1.0))
+    prior = 0.35 * x.square().sum(-1)
+    torch.testing.assert_close(plain.cost(x, 1.5)[0], 1.5 * events[0] + prior)
+    ghosts = more["ghosts"]
+    xy = places(homography(x, task.predicted, task.plane, task.seconds, task.chart), ghosts)
+    vain = (lookup(more["ground"], xy)[0] * ghosts.weight).sum(-1)
+    torch.testing.assert_close(task.cost(x, 1.5)[0], 1.5 * (events[0] + vain) + prior)
+    torch.testing.assert_close(task.cost(x, 1.5)[2], events[2])  # ghosts are not found
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_window_slides_back_onto_its_edges(scene, compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setenv(kernels.SWITCH, "0")
+    task = task_of(scene, off=2.0)
+    found = match(torch.zeros(2, SIZE, dtype=DOUBLE), task, EXACT)
+    assert found.converged.all()
+    assert (apart(scene, task, replace(found, x=torch.zeros_like(found.x))) > 0.8).all()
+    assert (apart(scene, task, found) < 0.25).all()
+    assert (found.cost < task.cost(torch.zeros_like(found.x), EXACT.weight)[0]).all()
+    torch.testing.assert_close(found.slope[:, :SIZE], torch.zeros(2, SIZE, dtype=DOUBLE), rtol=0, atol=0.5)
+    moved = task.predicted.moved((found.x * units(task.predicted, task.plane, task.seconds, FOCAL))[:, :SIZE])
+    torch.testing.assert_close(found.state.step_to(moved), torch.zeros(2, SIZE, dtype=DOUBLE), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.strength, task.cost(found.x, 1.0)[2] / 900)
+
+
+def test_a_certain_prediction_is_hardly_left(scene):
+    task = task_of(scene, off=2.0, certain=1e7)
+    found = match(torch.zeros(2, SIZE, dtype=DOUBLE), task, EXACT)
+    assert found.x.abs().max() < 1e-3
+
+
+def test_only_what_the_basis_has_moves(scene):
+    basis = BASIS[:, [0, 1, 2, 6, 7, 8]]
+    found = match(torch.zeros(2, 6, dtype=DOUBLE), task_of(scene, off=1.0, basis=basis), EXACT)
+    assert (found.x[:, [3, 4, 5, 9, 10, 11, 12, 13]] == 0).all()
+    assert (found.x[:, [0, 1, 2, 6, 7, 8]] != 0).all()
+
+
+def test_the_twin_finds_for_a_window_in_a_batch_what_it_finds_for_it_alone(scene):
+    task, q = task_of(scene, off=1.5, **haunted(scene)), torch.zeros(2, SIZE, dtype=DOUBLE)
+    spare = Ink(*(torch.nn.functional.pad(getattr(task.ink, n), (0, 40)) for n in ("x", "y", "s", "weight")))
+    how = replace(EXACT, stop=replace(EXACT.stop, iterations=4))
+    together = descend(q, replace(task, ink=spare), how)
+    for i in range(2):
+        alone = descend(q[:1], task[torch.tensor([i])], how)
+        for a, b in zip(alone, together, strict=True):
+            torch.testing.assert_close(a[0], b[i], rtol=1e-6, atol=1e-6)
+
+
+def votes_of(scene):
+    """The map's events, drawn sharp on the chart: what the window is to be drawn upon."""
+    place = curves(6000, seed=70)
+    ink = Ink(*(part[None] for part in (place[:, 0] / FOCAL, place[:, 1] / FOCAL, 0 * place[:, 0], 1 + 0 * place[:, 0])))
+    rest = still(torch.zeros(1, 6, 3, 3, dtype=DOUBLE))
+    drawn = draw(rest, ink, Canvas(FOCAL, (0.0, 0.0), (HEIGHT, WIDTH)), torch.zeros(1, dtype=torch.int64))
+    return blur(drawn, 1.0).expand(len(scene[2]), -1, -1)
+
+
+def test_the_variance_of_window_and_map_together_sharpens_it(scene):
+    how = replace(EXACT, objective="variance", stop=Stop(tolerance=0.01, iterations=40))
+    task = task_of(scene, off=2.0, votes=votes_of(scene))
+    found = match(torch.zeros(2, SIZE, dtype=DOUBLE), task, how)
+
+    def minus_log_variance(x):
+        H_k = homography(x, task.predicted, task.plane, task.seconds, task.chart)
+        image = draw(H_k, task.ink, Canvas(FOCAL, (0.0, 0.0), (HEIGHT, WIDTH)), torch.arange(2))
+        return -variance(image + task.votes).log()
+
+    before, after = minus_log_variance(torch.zeros_like(found.x)), minus_log_variance(found.x)
+    torch.testing.assert_close(found.cost, after, rtol=0, atol=1e-3)  # the last short step is not evaluated
+    assert (after < before - 0.01).all()
+    assert (apart(scene, task, found) < 0.5 * apart(scene, task, replace(found, x=torch.zeros_like(found.x)))).all()
+    assert (found.information == 0).all()
+    assert (found.slope == 0).all()
+
+
+def test_without_votes_there_is_no_variance(scene):
+    with pytest.raises(ValueError, match="wants the votes of the map"):
+        sharpen(torch.zeros(2, SIZE, dtype=DOUBLE), task_of(scene), replace(EXACT, objective="variance"))
+
+
+@pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.02), (1.0, 0.02), (4.0, 0.08)])
+def test_on_a_blurred_map_the_search_is_done_earlier(sigma, tolerance):
+    how = Matching(weight=0.5)
+    coarse = how.coarse(sigma)
+    assert coarse.stop.tolerance == pytest.approx(tolerance)
+    assert replace(coarse, stop=how.stop) == how
+
+
+def test_charts_are_joined_with_nothing_around_the_smaller(scene):
+    chart = scene[3]
+    small = Chart(chart.texture[:1, :40, :50], chart.corner[:1], chart.view[:1], FOCAL)
+    joined = Chart.join([small, chart])
+    assert joined.texture.shape == (3, HEIGHT, WIDTH)
+    assert torch.equal(joined.texture[0, :40, :50], small.texture[0])
+    assert (joined.texture[0, 40:] == 0).all()
+    assert (joined.texture[0, :, 50:] == 0).all()
+    assert torch.equal(joined.texture[1:], chart.texture)
+    filled = joined.filled([small.texture[0], chart.texture[0], chart.texture[1]])
+    assert torch.equal(filled, joined.texture)
+    assert torch.equal(joined.frame[:, 1:-1, 1:-1], joined.texture)
+    assert Chart.join([small]) is small
