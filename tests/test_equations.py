@@ -17,6 +17,7 @@ from torchcmax.core.model import Planar, Rotation
 from torchcmax.core.objective import Look, objective
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
+from torchcmax.core.state import State
 from torchcmax.core.vote import vote
 from torchcmax.core.warp import monomials, polynomial, transfer, warp
 from torchcmax.core.window import Window
@@ -175,6 +176,23 @@ def test_eq_2_15_and_2_16_the_next_window_begins_where_this_one_ends():
     after = motion.following(pose, dt)
     equal(after.t, (pose.R @ (motion.velocity * dt[:, None])[..., None])[..., 0] + pose.t)
     equal(after.R, pose.R @ so3.exp(motion.omega * dt[:, None]))
+
+
+def test_eq_2_14_the_placement_of_a_state_is_the_warp_to_the_map_and_its_turn(ray):
+    """The map's pixel is that of the turned ray to the point of the plane; all in one matrix."""
+    world, pose = Plane.tilted(rand(2, 2) - 0.5), Pose(so3.exp(0.3 * rand(2, 3)), 0.3 * rand(2, 3, seed=4))
+    placed = ray @ State(pose, Motion(rand(2, 3), rand(2, 3))).placement(world, world.facing()).mT
+    equal(pixels(placed), pixels(transfer(ray, pose[:, None], world) @ world.facing().mT))
+
+
+def test_eq_2_15_and_2_16_the_state_of_a_camera_goes_on_as_they_say():
+    """And the velocity, which is constant in the world, turns with the camera's frame."""
+    pose, motion, dt = Pose(so3.exp(rand(2, 3)), rand(2, 3, seed=1)), Motion(rand(2, 3, seed=2), rand(2, 3, seed=3)), rand(2, seed=4)
+    after, expected = State(pose, motion).later(dt), motion.following(pose, dt)
+    equal(after.pose.R, expected.R)
+    equal(after.pose.t, expected.t)
+    equal((after.pose.R @ after.motion.velocity[..., None]), pose.R @ motion.velocity[..., None])
+    equal(after.motion.omega, motion.omega)
 
 
 def test_eq_a_1_the_gradient_of_variance_is_twice_the_deviation_from_the_mean():

@@ -35,7 +35,7 @@ from torchcmax.core.state import SIZE, State
 from torchcmax.core.warp import still
 
 DOUBLE, FOCAL, HEIGHT, WIDTH = torch.float64, 90.0, 100, 120
-EXACT = Matching(stop=Stop(tolerance=2e-3, iterations=60, longest=5.0), every=1)  # bilinear kinks forbid more
+EXACT = Matching(stop=Stop(tolerance=0.01, iterations=60, longest=5.0), every=1)  # bilinear kinks forbid more
 BASIS = torch.eye(NUMBERS, SIZE, dtype=DOUBLE)
 
 
@@ -107,46 +107,11 @@ def central(f, x, h=1e-7):
     return torch.stack([(f(x + side) - f(x - side)) / (2 * h) for side in sides], -1)
 
 
-def test_a_lookup_by_hand():
-    """Value, slope along x, slope along y in the picture 1 2 / 3 4, and where half of the four pixels are missing."""
-    texture = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]], dtype=DOUBLE)
-    by_hand = {
-        (0.0, 0.0): (1.0, 1.0, 2.0),
-        (0.5, 0.5): (2.5, 1.0, 2.0),
-        (0.25, 0.75): (2.75, 1.0, 2.0),
-        (-0.5, 0.0): (0.5, 1.0, 1.0),
-        (0.0, -0.25): (0.75, 0.75, 1.0),
-        (1.5, 0.0): (1.0, -2.0, 1.0),
-        (1.75, 1.75): (0.25, -1.0, -1.0),
-    }
-    strength, slope = lookup(texture, torch.tensor([list(by_hand)], dtype=DOUBLE))
-    expected = torch.tensor(list(by_hand.values()), dtype=DOUBLE)
-    torch.testing.assert_close(strength[0], expected[:, 0])
-    torch.testing.assert_close(slope[0], expected[:, 1:])
-
-
-@pytest.mark.parametrize("place", [(-1.0, 0.5), (2.0, 0.5), (0.5, -1.0), (0.5, 2.0), (1e9, 0), (-1e30, 0), (math.nan, 0.5), (0, math.inf)])
-def test_nothing_is_found_outside(place):
-    strength, slope = lookup(torch.ones(1, 2, 2, dtype=DOUBLE), torch.tensor([[place]], dtype=DOUBLE))
-    assert strength.tolist() == [[0]]
-    assert slope.tolist() == [[[0, 0]]]
-
-
-def test_a_lookup_is_what_grid_sample_finds_and_its_slope_that_of_autograd():
-    texture, xy = rand(2, 9, 14), (rand(2, 300, 2, seed=1) * torch.tensor([18, 13], dtype=DOUBLE) - 2).requires_grad_()
-    grid = xy * torch.tensor([2 / 13, 2 / 8], dtype=DOUBLE) - 1
-    expected = torch.nn.functional.grid_sample(texture[:, None], grid[:, None], padding_mode="zeros", align_corners=True)[:, 0, 0]
-    (expected_slope,) = torch.autograd.grad(expected.sum(), xy)
-    strength, slope = lookup(texture, xy.detach())
-    torch.testing.assert_close(strength, expected.detach(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(slope, expected_slope, rtol=0, atol=1e-12)
-
-
 def test_at_the_truth_the_events_lie_on_the_edges(scene):
     x = torch.zeros(2, NUMBERS, dtype=DOUBLE)
     count = scene[-1].x.shape[1]
     there = evaluate(x, *scene)[2] / count
-    assert (there > 0.3).all()
+    assert (there > 0.9).all()
     assert (evaluate(x + 4.0, *scene)[2] / count < 0.6 * there).all()
 
 
@@ -166,23 +131,6 @@ def test_the_slope_of_the_match_is_that_of_central_differences(scene):
     torch.testing.assert_close(gradient, central(lambda x: evaluate(x, *problem)[0], x), rtol=1e-4, atol=1e-4)
     assert (value < 0).all()
     assert (found > -value).all()  # T is more than T - T^2/2
-
-
-def test_one_event_by_hand():
-    """On an edge of strength T it is worth T^2/2 - T; padded, outside or behind the camera it is worth nothing."""
-    rest = torch.zeros(4, 3, dtype=DOUBLE)
-    eye = torch.eye(3, dtype=DOUBLE).expand(4, 3, 3)
-    wall, state = Plane.tilted(rest[:, :2]), State(Pose(eye, rest), Motion(rest, rest))
-    texture = torch.zeros(4, 5, 5, dtype=DOUBLE)
-    texture[:, 2, 3] = 0.8
-    chart = Chart(texture, torch.full((4, 2), -2.0, dtype=DOUBLE), eye, 10.0)
-    ink = Ink(*(torch.tensor(part, dtype=DOUBLE)[:, None] for part in ([0.05, 0.05, 5.0, 0.05], [0.0] * 4, [0.0] * 4, [1.0, 0, 1, 1])))
-    state = State(Pose(torch.cat([eye[:3], -eye[:1]]), rest), state.motion)  # the last looks the other way
-    value, gradient, found = evaluate(torch.zeros(4, NUMBERS, dtype=DOUBLE), state, wall, torch.ones(4, dtype=DOUBLE), chart, ink)
-    torch.testing.assert_close(value, torch.tensor([0.4**2 / 2 - 0.4, 0, 0, 0], dtype=DOUBLE))
-    torch.testing.assert_close(found, torch.tensor([0.4, 0, 0, 0], dtype=DOUBLE))
-    assert gradient[0, 3].item() == pytest.approx((0.4 - 1) * 0.8)  # a shift to the right by one px
-    assert (gradient[1:] == 0).all()
 
 
 def test_the_curvature_is_that_of_each_event_by_itself(scene):
@@ -260,7 +208,7 @@ def test_a_window_slides_back_onto_its_edges(scene, compiled, monkeypatch):
     found = match(torch.zeros(2, SIZE, dtype=DOUBLE), task, EXACT)
     assert found.converged.all()
     assert (apart(scene, task, replace(found, x=torch.zeros_like(found.x))) > 0.8).all()
-    assert (apart(scene, task, found) < 0.25).all()
+    assert (apart(scene, task, found) < 0.15).all()
     assert (found.cost < task.cost(torch.zeros_like(found.x), EXACT.weight)[0]).all()
     torch.testing.assert_close(found.slope[:, :SIZE], torch.zeros(2, SIZE, dtype=DOUBLE), rtol=0, atol=0.5)
     moved = task.predicted.moved((found.x * units(task.predicted, task.plane, task.seconds, FOCAL))[:, :SIZE])
@@ -290,6 +238,33 @@ def test_the_twin_finds_for_a_window_in_a_batch_what_it_finds_for_it_alone(scene
         alone = descend(q[:1], task[torch.tensor([i])], how)
         for a, b in zip(alone, together, strict=True):
             torch.testing.assert_close(a[0], b[i], rtol=1e-6, atol=1e-6)
+
+
+def padded(task):
+    """Two windows whose events and charts differ in size, joined; and each by itself."""
+    small = Chart(task.chart.texture[:1, :80, :70], task.chart.corner[:1], task.chart.view[:1], FOCAL)
+    large, first, second = task[torch.tensor([1])].chart, slice(0, 1), slice(1, 2)
+    inks = Ink(*(getattr(task.ink, n)[first, :500] for n in ("x", "y", "s", "weight"))), task.ink[second]
+    alone = [replace(task[torch.tensor([i])], chart=(small, large)[i], ink=inks[i]) for i in (0, 1)]
+    return replace(task, chart=Chart.join([small, large]), ink=Ink.join(inks)), alone
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
+@pytest.mark.parametrize("columns", [range(12), (0, 1, 2, 6, 7, 8), (3, 4, 5, 9, 10, 11)], ids=["planar", "rotation", "translation"])
+def test_the_kernel_finds_for_windows_that_were_padded_exactly_what_it_finds_for_them_alone(scene, dtype, columns):
+    pytest.importorskip("numba", reason="numba is not installed")
+    task = task_of(scene, off=1.0, basis=BASIS[:, list(columns)], **haunted(scene))
+    single = lambda ink: Ink(*(getattr(ink, n).to(dtype) for n in ("x", "y", "s", "weight")))  # noqa: E731
+    task = replace(task, ink=single(task.ink), some=single(task.some), ghosts=single(task.ghosts), ground=task.ground[:, :80, :70])
+    together, alone = padded(task)
+    together = replace(together, ground=together.chart.filled(list(task.ground)))
+    alone[1] = replace(alone[1], ground=together.ground[1:])
+    q = torch.zeros(2, len(columns), dtype=DOUBLE)
+    found = match(q, together, EXACT)
+    for i, one in enumerate(alone):
+        lone = match(q[:1], one, EXACT)
+        for name in ("x", "cost", "slope", "information", "strength", "evaluations", "converged"):
+            assert torch.equal(getattr(lone, name)[0], getattr(found, name)[i]), name
 
 
 def votes_of(scene):
@@ -322,26 +297,3 @@ def test_the_variance_of_window_and_map_together_sharpens_it(scene):
 def test_without_votes_there_is_no_variance(scene):
     with pytest.raises(ValueError, match="wants the votes of the map"):
         sharpen(torch.zeros(2, SIZE, dtype=DOUBLE), task_of(scene), replace(EXACT, objective="variance"))
-
-
-@pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.02), (1.0, 0.02), (4.0, 0.08)])
-def test_on_a_blurred_map_the_search_is_done_earlier(sigma, tolerance):
-    how = Matching(weight=0.5)
-    coarse = how.coarse(sigma)
-    assert coarse.stop.tolerance == pytest.approx(tolerance)
-    assert replace(coarse, stop=how.stop) == how
-
-
-def test_charts_are_joined_with_nothing_around_the_smaller(scene):
-    chart = scene[3]
-    small = Chart(chart.texture[:1, :40, :50], chart.corner[:1], chart.view[:1], FOCAL)
-    joined = Chart.join([small, chart])
-    assert joined.texture.shape == (3, HEIGHT, WIDTH)
-    assert torch.equal(joined.texture[0, :40, :50], small.texture[0])
-    assert (joined.texture[0, 40:] == 0).all()
-    assert (joined.texture[0, :, 50:] == 0).all()
-    assert torch.equal(joined.texture[1:], chart.texture)
-    filled = joined.filled([small.texture[0], chart.texture[0], chart.texture[1]])
-    assert torch.equal(filled, joined.texture)
-    assert torch.equal(joined.frame[:, 1:-1, 1:-1], joined.texture)
-    assert Chart.join([small]) is small

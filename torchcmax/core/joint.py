@@ -39,6 +39,8 @@ class Joint:
     """Weight of that guard, in log contrast per (log area)^2."""
     acceleration: tuple[float, float] = (20.0, 8.0)
     """What the motion may change by from window to window: rad/s^2 and plane distances/s^2, one sigma."""
+    free: tuple[bool, bool] = (True, True)
+    """Whether angular velocity and velocity are sought, or stay as they are."""
     steady: float = 0.03
     """Weight of such changes, in log contrast per square of a sigma: it decides where the windows do not."""
 
@@ -68,12 +70,18 @@ def units(frames: Frames, focal: float) -> Tensor:
     return torch.stack([one, away, one / frames.seconds, away / frames.seconds], -1).repeat_interleave(3, -1)
 
 
-def chained(frames: Frames, focal: float, middle: int) -> Way:
+def rates(frames: Frames, focal: float, free: tuple[bool, bool]) -> Tensor:
+    """What one px is of the angular velocity and the velocity of each frame, nothing where they are not sought: [F, 6]."""
+    sought = torch.tensor([free[0]] * 3 + [free[1]] * 3, device=frames.seconds.device)
+    return units(frames, focal)[:, 6:] * sought
+
+
+def chained(frames: Frames, focal: float, middle: int, free: tuple[bool, bool] = (True, True)) -> Way:
     """Angular velocity and velocity of each frame, x [F * 6]; the poses follow from them, from the middle frame on.
 
     One window begins where the last one ends.
     """
-    scale = units(frames, focal)[:, 6:]
+    scale = rates(frames, focal, free)
 
     def states(x: Tensor) -> State:
         step = x.view(-1, 6) * scale
@@ -187,11 +195,11 @@ def rays_of(H_k: Tensor, ink: Ink) -> Tensor:
     return total.mT
 
 
-def whitened_chain(frames: Frames, focal: float, eye: Pose, middle: int) -> Whiten:
+def whitened_chain(frames: Frames, focal: float, eye: Pose, middle: int, free: tuple[bool, bool] = (True, True)) -> Whiten:
     """The whole metric, as each window moves all those after it: y [F * 6 + 2] -> x, tilt."""
     count, some = len(frames), frames.ink.sample(SAMPLES)
     state = chained(frames, focal, middle)(frames.seconds.new_zeros(6 * count))
-    follows = following(replace(frames, state=state), units(frames, focal)[:, 6:], middle)  # [F, 12, F * 6]
+    follows = following(replace(frames, state=state), rates(frames, focal, free), middle)  # [F, 12, F * 6]
 
     def pixels(step: Tensor, tilt: Tensor) -> Tensor:
         ray = rays_of(onto(state.moved(step), tilted(frames.plane, tilt), frames.seconds, eye), some)
@@ -284,10 +292,10 @@ def optimize(common: Common, count: int) -> Solved:
 
 def optimize_chain(frames: Frames, focal: float, how: Joint, middle: int) -> Solved:
     """Motions and plane of consecutive windows, seen from the middle one: 6 F + 2 numbers."""
-    way, eye = chained(frames, focal, middle), frames.state.pose[middle : middle + 1]
+    way, eye = chained(frames, focal, middle, how.free), frames.state.pose[middle : middle + 1]
     with torch.no_grad():
         states = way(frames.seconds.new_zeros(6 * len(frames)))
         H_k = onto(states, frames.plane, frames.seconds, eye)
         canvas = canvas_of(H_k, frames.ink.sample(SAMPLES), focal)
-        whiten = whitened_chain(frames, focal, eye, middle)
+        whiten = whitened_chain(frames, focal, eye, middle, how.free)
     return optimize(Common(frames, way, eye, canvas, how, whiten, areas(H_k)), 6 * len(frames) + 2)

@@ -231,7 +231,7 @@ class Task:
 def match(q: Tensor, task: Task, how: Matching) -> Match:
     """Where the windows fit the map: q [B, M] px, the start of the search -> Match [B].
 
-    Minimizes weight * -sum(T - T^2/2) + x^T prior x / 2 by Levenberg-Marquardt; in machine code where there is some for it.
+    Minimizes weight * -sum(T - T^2/2) + x^T prior x / 2 by BFGS from the events' own curvature; in machine code where there is some for it.
     """
     kernel = kernels.drawing(task.ink.x)
     if how.objective == "variance":

@@ -249,9 +249,9 @@ def match(q, basis, place, prior, events, ghosts, some, lens, frames, stop, weig
                     inverse, fresh, trials, low, high = plain.copy(), True, 0, 0.0, np.inf
                     step, limit, length = aimed(inverse, gradient, G, True, stop)
         else:
-            learn(inverse, near - q, gradient_new - gradient, False)
+            fresh = not learn(inverse, near - q, gradient_new - gradient, False) and fresh
             q, value, gradient, found = near, value_new, gradient_new, found_new
-            iterations, trials, low, high, fresh = iterations + 1, 0, 0.0, np.inf, False
+            iterations, trials, low, high = iterations + 1, 0, 0.0, np.inf
             step, limit, length = aimed(inverse, gradient, G, True, stop)
             converged = length * length_in(step, G) < stop.tolerance
             if converged:  # the last step is as good as sure, and not evaluated

@@ -108,15 +108,16 @@ class Settled:
     cost: float
 
 
-def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | None = None) -> Settled:
+def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | None = None, basis: Tensor | None = None) -> Settled:
     """One round of joint optimization: each of the last keyframes [k] finds its place in the map of all others, and the plane tilts.
 
     12 k + 2 numbers; the first keyframe stays, and with it the world.  The tilt is the step that its events want, given that
-    every keyframe would follow (Schur's complement), and that it was `start`, more or less.
+    every keyframe would follow (Schur's complement), and that it was `start`, more or less.  basis [14, M]: how keyframes may move.
     """
     count = len(m.keyframes)
     free = range(max(1, count - (last or count)), count)
-    found = {i: _placed(m, i, matching) for i in free}
+    matching = replace(matching, objective="lookup")
+    found = {i: _placed(m, i, matching, basis) for i in free}
     matches = {i: one for i, one in found.items() if one is not None}
     normal, push = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     for one in matches.values():
@@ -148,19 +149,21 @@ class _Placed:
     pull: Tensor
 
 
-def _placed(m: Map, number: int, matching: Matching) -> _Placed | None:
-    task, keyframe = before_others(m, number, matching), m.keyframes[number]
+def _placed(m: Map, number: int, matching: Matching, basis: Tensor | None) -> _Placed | None:
+    task, keyframe = before_others(m, number, matching, basis), m.keyframes[number]
     if task is None:
         return None
-    found = match(torch.zeros(1, SIZE, dtype=torch.float64), task, matching)
+    found = match(torch.zeros(1, task.basis.shape[1], dtype=torch.float64), task, matching)
     A, slope = (found.information + task.prior)[0], found.slope[0]
-    pull = torch.linalg.solve(A[:SIZE, :SIZE], A[:SIZE, SIZE:])
+    B = task.basis[:SIZE]
+    pull = B @ torch.linalg.solve(B.mT @ A[:SIZE, :SIZE] @ B, B.mT @ A[:SIZE, SIZE:])
     normal, push = A[SIZE:, SIZE:] - A[SIZE:, :SIZE] @ pull, slope[SIZE:] - pull.mT @ slope[:SIZE]
     return _Placed(found, units(keyframe.state, m.plane, keyframe.seconds, m.focal), normal, push, pull)
 
 
-def before_others(m: Map, number: int, matching: Matching) -> Task | None:
+def before_others(m: Map, number: int, matching: Matching, basis: Tensor | None = None) -> Task | None:
     """A keyframe before the map of all others; None where nothing of them is in its view."""
+    basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64) if basis is None else basis
     keyframe, own = m.keyframes[number], m.drawn(number)
     if own is None:
         return None
@@ -172,5 +175,4 @@ def before_others(m: Map, number: int, matching: Matching) -> Task | None:
         return None
     ghosts, ground = m.by_chance(few, chart, H_k, area)
     loose = torch.tensor([LOOSE[0] ** -2] * 6 + [LOOSE[1] ** -2] * 6 + [0.0] * 2, dtype=torch.float64)
-    basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64)
     return Task(keyframe.state, m.plane, keyframe.seconds, chart, few, keyframe.ink.sample(SOME), loose.diag()[None], basis, ghosts, ground)

@@ -21,7 +21,7 @@ from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.slam.map import Keyframe, Map, Texture
 from torchcmax.slam.mapper import Mapping, first_plane, rebased, settled
-from torchcmax.slam.tracker import Belief, Front, ModelName, Step, Tracking, front, rays_of, speed, step
+from torchcmax.slam.tracker import Belief, Front, ModelName, Step, Tracking, basis_of, front, rays_of, speed, step
 
 Status = Literal["start", "ok", "weak", "lost"]
 KNOWN = 0.5  # share of the usual strength below which a window is weak
@@ -156,6 +156,12 @@ class _Run:
             raise ValueError("there is no map before the first plane is found")
         return self._map
 
+    @property
+    def sought(self) -> Mapping:
+        """How the first plane is found with this model."""
+        how, model = self.options.mapping, self.options.model
+        return replace(how, joint=replace(how.joint, free=(model != "translation", model != "rotation")))
+
     def window(self, state: State, plane: Plane) -> Window | None:
         """The next window: as long as the image takes to move by the displacement wanted."""
         how = self.options.tracking
@@ -177,7 +183,7 @@ class _Run:
         if self.given is not None:
             yield from self._on_map(windows, fronts)
             return
-        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, self.options.mapping).frames)
+        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, self.sought).frames)
         self.start_plane = solved.plane
         self._map = Map(solved.plane, self.canvas.focal, self.border, self.options.texture, number=self.number)
         for i, window in enumerate(windows):
@@ -294,7 +300,8 @@ class _Run:
     def _settle(self, last: int | None) -> None:
         """One round; the camera goes with the newest keyframe."""
         before = self.map.keyframes[-1].state.pose
-        self._map = settled(self.map, self.start_plane, self.options.mapping, self.options.tracking.matching, last).map
+        basis = basis_of(self.options.model, "full")
+        self._map = settled(self.map, self.start_plane, self.options.mapping, self.options.tracking.matching, last, basis).map
         if self.index:
             pose = self.map.keyframes[-1].state.pose @ before.inverse() @ self.belief.state.pose
             self.belief = replace(self.belief, state=replace(self.belief.state, pose=pose))
