@@ -117,11 +117,9 @@ class _Dots:
         start = (time[:1] * 1e6).long()
         return Window(self.ray[None, part], (time - time[0])[None], torch.ones_like(time)[None], start, time[-1:] - time[:1])
 
-    def take(self, events: int, seconds: float) -> Window | None:
+    def skip(self, events: int) -> None:
         """As `Source`."""
-        window = self.look(events, seconds)
-        self.done += 0 if window is None else window.ray.shape[1]
-        return window
+        self.done += events
 
 
 def load_kernels(slam: Slam, device: str = "cpu") -> None:

@@ -20,9 +20,8 @@ from torchcmax.core.joint import (
     onto,
     optimize_chain,
     products,
-    rays_of,
+    rates,
     tilted,
-    units,
     whitened_chain,
 )
 from torchcmax.core.plane import Plane
@@ -75,7 +74,7 @@ def scene(count=8, events=700, tilt=(0.25, -0.2)):
 
 def off(frames, size, tilt=(0.0, 0.0), seed=9):
     """The frames with motions that are wrong by up to `size` px of a window, and with another plane."""
-    wrong = 2 * size * (rand(len(frames), 6, seed=seed) - 0.5) * units(frames, FOCAL)[:, 6:]
+    wrong = 2 * size * (rand(len(frames), 6, seed=seed) - 0.5) * rates(frames, FOCAL)
     motion = frames.state.motion
     state = State(frames.state.pose, Motion(motion.omega + wrong[:, :3], motion.velocity + wrong[:, 3:]))
     return replace(frames, state=state, plane=tilted(frames.plane, torch.tensor(tilt, dtype=DOUBLE)))
@@ -93,7 +92,7 @@ def apart(found, truth):
     """px rms between where the events of all frames are seen and where they are, from the eye of the middle frame."""
     middle, xy = len(truth) // 2, []
     for frames in (found, truth):
-        ray = rays_of(onto(frames.state, frames.plane, truth.seconds, truth.state.pose[middle : middle + 1]), truth.ink)
+        ray = truth.ink.warped(onto(frames.state, frames.plane, truth.seconds, truth.state.pose[middle : middle + 1]))
         xy.append(FOCAL * ray[..., :2] / ray[..., 2:])
     return float((xy[0] - xy[1]).square().sum(-1).mean().sqrt())
 
@@ -133,7 +132,7 @@ def test_the_states_of_a_chain_follow_its_numbers_as_central_differences_do(midd
     frames = off(scene(count=5, events=10), 3.0)
     way, h = chained(frames, FOCAL, middle), 1e-4
     here = way(torch.zeros(30, dtype=DOUBLE))
-    found = following(replace(frames, state=here), units(frames, FOCAL)[:, 6:], middle)
+    found = following(replace(frames, state=here), rates(frames, FOCAL), middle)
     sides = h * torch.eye(30, dtype=DOUBLE)
     expected = torch.stack([(here.step_to(way(side)) - here.step_to(way(-side))) / (2 * h) for side in sides], -1)
     equal(found, expected, 1e-9)
@@ -153,7 +152,7 @@ def test_a_small_step_is_carried_into_another_camera_s_frame():
 def test_events_are_seen_by_the_eye_as_their_points_of_the_plane_are():
     frames = off(scene(count=3, events=50), 2.0, (0.1, 0.1))
     eye = Pose(so3.exp(torch.tensor([[0.1, -0.2, 0.3]], dtype=DOUBLE)), torch.tensor([[0.1, 0.2, -0.1]], dtype=DOUBLE))
-    found = rays_of(onto(frames.state, frames.plane, frames.seconds, eye), frames.ink)
+    found = frames.ink.warped(onto(frames.state, frames.plane, frames.seconds, eye))
     pose = frames.state.pose[:, None] @ frames.state.motion.at(frames.ink.s * SECONDS)
     relative = eye.inverse()[:, None] @ pose
     expected = transfer(frames.ink.ray.mT, relative, frames.plane.seen_from(eye).repeated(3))
@@ -163,7 +162,7 @@ def test_events_are_seen_by_the_eye_as_their_points_of_the_plane_are():
 def test_rays_of_events_are_those_of_the_warp():
     frames = scene(count=3, events=50)
     H_k = onto(frames.state, frames.plane, frames.seconds, frames.state.pose[1:2])
-    equal(rays_of(H_k, frames.ink), warp(H_k, monomials(frames.ink.ray.mT, frames.ink.s)).mT)
+    equal(frames.ink.warped(H_k), warp(H_k, monomials(frames.ink.ray.mT, frames.ink.s)).mT)
 
 
 def test_the_common_canvas_holds_the_events_and_not_much_more():
@@ -172,7 +171,7 @@ def test_the_common_canvas_holds_the_events_and_not_much_more():
     canvas = canvas_of(H_k, frames.ink, FOCAL)
     drawn = draw(H_k, frames.ink, canvas, torch.arange(8)).sum((1, 2))
     equal(drawn, torch.full((8,), 700.0, dtype=DOUBLE), 1e-6)
-    xy = canvas.pixels(rays_of(H_k, frames.ink)).flatten(0, 1)
+    xy = canvas.pixels(frames.ink.warped(H_k)).flatten(0, 1)
     extent = xy.amax(0) - xy.amin(0)
     assert canvas.size[1] < 1.3 * extent[0] + 20
     assert canvas.size[0] < 1.3 * extent[1] + 20
@@ -190,7 +189,7 @@ def test_one_whitened_unit_moves_each_coordinate_of_the_events_by_about_a_pixel(
 
 def common_places(common, y):
     states, plane = common.at(y)
-    ray = rays_of(onto(states, plane, common.frames.seconds, common.eye), common.frames.ink)
+    ray = common.frames.ink.warped(onto(states, plane, common.frames.seconds, common.eye))
     return ray[..., :2] / ray[..., 2:]
 
 
@@ -240,7 +239,7 @@ def test_changes_of_the_motion_by_hand():
 @pytest.mark.parametrize("free", [(True, False), (False, True)])
 def test_what_is_not_free_stays_as_it_is(free):
     start = off(scene(count=4, events=300), 2.0)
-    solved = optimize_chain(start, FOCAL, Joint(free=free), 2)
+    solved = optimize_chain(replace(start, free=free), FOCAL, Joint(), 2)
     for name, goes in zip(("omega", "velocity"), free, strict=True):
         assert torch.equal(getattr(solved.frames.state.motion, name), getattr(start.state.motion, name)) != goes
     assert solved.contrast > solved.before
@@ -305,3 +304,9 @@ def test_torch_lbfgs_finds_the_same_minimum():
     lowest, states, plane = float(common.cost(y.detach())), *common.at(y.detach())
     assert -math.log(solved.contrast) == pytest.approx(lowest, abs=2e-3)
     assert apart(replace(start, state=states, plane=plane), solved.frames) < 0.1
+
+
+@pytest.mark.parametrize("wrong", [{"contrast": "beauty"}, {"sigma": -1.0}, {"deformation": 1.0}, {"acceleration": (0.0, 1.0)}])
+def test_a_joint_without_sense_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"none of|joint wants"):
+        Joint(**wrong)

@@ -297,3 +297,9 @@ def test_the_variance_of_window_and_map_together_sharpens_it(scene):
 def test_without_votes_there_is_no_variance(scene):
     with pytest.raises(ValueError, match="wants the votes of the map"):
         sharpen(torch.zeros(2, SIZE, dtype=DOUBLE), task_of(scene), replace(EXACT, objective="variance"))
+
+
+@pytest.mark.parametrize("wrong", [{"objective": "guess"}, {"refine": "nothing"}, {"weight": 0.0}, {"every": 0}])
+def test_a_matching_without_sense_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"none of|matching wants"):
+        Matching(**wrong)

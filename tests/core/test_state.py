@@ -94,21 +94,8 @@ def steps_later(state, dt, h=1e-5):
 
 @pytest.mark.parametrize("dtype", [torch.float64], indirect=False)
 def test_stepping_is_that_of_central_differences(state, rand):
-    """All of it but the change of the velocity with the turn, which is to first order in the angle."""
     dt = 0.2 * rand(4)
-    F, exact = state.stepping(dt), steps_later(state, dt)
-    rough = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    rough[9:, 6:9] = True
-    torch.testing.assert_close(F[:, ~rough], exact[:, ~rough], rtol=0, atol=1e-8)
-    angle, speed = (dt * state.motion.omega.norm(dim=-1)), state.motion.velocity.norm(dim=-1)
-    off = (F - exact)[:, 9:, 6:9].abs().amax((1, 2))
-    assert (off <= 0.6 * angle * dt * speed).all()  # half the angle, times what the whole is
-
-
-@pytest.mark.parametrize("dtype", [torch.float64], indirect=False)
-def test_the_error_of_stepping_is_of_second_order_in_time(state):
-    off = [(state.stepping(dt) - steps_later(state, dt)).abs().max() for dt in (torch.full((4,), t).double() for t in (0.02, 0.01))]
-    assert off[1] < 0.3 * off[0] < 1e-4
+    torch.testing.assert_close(state.stepping(dt), steps_later(state, dt), rtol=0, atol=1e-8)
 
 
 def test_no_time_changes_no_step(state, close):

@@ -189,6 +189,18 @@ def test_a_look_takes_nothing():
         assert stream.position == some_events(50).t[20]
 
 
+def test_what_was_looked_at_can_be_skipped_and_nothing_else():
+    with recording(some_events(20), 7).stream() as looked, recording(some_events(20), 7).stream() as taken:
+        for count in (3, 9, 2):
+            window = looked.look(count, math.inf)
+            looked.skip(window.ray.shape[1])
+            assert_same(window, taken.take(count, math.inf))
+            assert (looked.consumed, looked.position) == (taken.consumed, taken.position)
+        for count in (0, 100):
+            with pytest.raises(ValueError, match="only events that were looked at"):
+                looked.skip(count)
+
+
 def test_windows_come_to_the_device_that_is_asked_for(device):
     with recording(some_events(50)).stream(device=device) as stream:
         window = stream.take(20, 1)

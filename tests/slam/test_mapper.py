@@ -9,15 +9,16 @@ from scenes import Scene, angle, drawn, map_of, pixels, state_of, wall
 
 from torchcmax.core.draw import Ink
 from torchcmax.core.joint import Frames
-from torchcmax.core.match import Matching
+from torchcmax.core.match import NUMBERS, Matching, match
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion
-from torchcmax.core.state import State
+from torchcmax.core.state import SIZE, State
 from torchcmax.core.window import Window
 from torchcmax.io import open
 from torchcmax.score import similarity
+from torchcmax.slam import mapper
 from torchcmax.slam.map import Map
-from torchcmax.slam.mapper import Mapping, before_others, first_plane, rebased, settled, thinned
+from torchcmax.slam.mapper import Mapping, before_others, explained, first_plane, rebased, settled, thinned
 from torchcmax.slam.tracker import rays_of
 
 ROUNDS = 4
@@ -113,7 +114,6 @@ def test_a_map_of_few_keyframes_settles_without_harm(poster, count):
     m = drawn(poster, range(count))
     found = settled(m, poster.plane, Mapping(), Matching())
     assert off(found.map, poster) < 1
-    assert math.isfinite(found.cost)
     assert angle(found.map.plane, poster.plane) < 5
 
 
@@ -125,6 +125,52 @@ def test_a_keyframe_that_meets_nothing_of_the_others_stays(poster):
     assert before_others(m, 5, Matching()) is None
     found = settled(m, poster.plane, Mapping(), Matching())
     assert torch.equal(found.map.keyframes[5].state.pose.t, far.pose.t)
+
+
+def torn(q, task, how):
+    """A match that puts a keyframe 6 px beside where it fits."""
+    found = match(q, task, how)
+    return replace(found, x=found.x + 6 * torch.eye(NUMBERS, dtype=torch.float64)[:1])
+
+
+def test_a_round_that_tears_the_newest_keyframe_off_the_others_leaves_the_old_map(poster, monkeypatch):
+    m = drawn(poster, range(8))
+    good = settled(m, poster.plane, Mapping(), Matching(), last=1)
+    assert good.accepted
+    assert good.map is not m
+    monkeypatch.setattr(mapper, "match", torn)
+    found = settled(m, poster.plane, Mapping(), Matching(), last=1)
+    assert not found.accepted
+    assert found.map is m
+    assert not found.tilt.any()
+
+
+def test_a_keyframe_meets_most_of_the_others_where_it_was(poster):
+    m = drawn(poster, range(8))
+    there, typical = m.keyframes[-1].state, m.typical()
+    shifts = (0.0, 0.01, 0.03)  # rad
+    met = []
+    for shift in shifts:
+        step = torch.zeros(1, SIZE, dtype=torch.float64)
+        step[0, 1] = shift
+        moved = drawn(poster, range(7))
+        moved.draw([m.keyframes[-1].at(there.moved(step))])
+        met.append(explained(moved, 7, Matching(), typical))
+    assert met[0] > 1.1 * met[1] > 1.1 * met[2] > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"first": 0}, "first of at least 1"),
+        ({"every": 0}, "every of at least 1"),
+        ({"overlap": 1.5}, "overlap of 0 to 1"),
+        ({"doubt": 0.0}, "doubt above 0"),
+    ],
+)
+def test_a_mapping_without_sense_is_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        Mapping(**wrong)
 
 
 def frames(plane: Plane) -> Frames:
@@ -180,7 +226,7 @@ def first(recorded):
 def from_tilt(first, count, tilt):
     windows, motions, focal, plane = first
     tilt = torch.as_tensor(tilt, dtype=torch.float64).view(1, 2)
-    solved = first_plane(windows[:count], motions[:count], focal, Mapping(thinned=2000), tilt)
+    solved = first_plane(windows[:count], motions[:count], focal, Mapping(thinned=2000), Plane.tilted(tilt))
     return solved.contrast, angle(rebased(solved.frames).plane, plane)
 
 

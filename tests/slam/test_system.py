@@ -155,8 +155,8 @@ class Blind:
     def look(self, events, seconds):
         return self.spoilt(self.stream.look(events, seconds))
 
-    def take(self, events, seconds):
-        return self.spoilt(self.stream.take(events, seconds))
+    def skip(self, events):
+        self.stream.skip(events)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from torchcmax.core.match import NUMBERS, Matching, units
 from torchcmax.core.pose import Motion
 from torchcmax.core.state import SIZE, State
 from torchcmax.slam.system import middle_of
-from torchcmax.slam.tracker import Belief, Tracking, basis_of, front, rays_of, speed, step
+from torchcmax.slam.tracker import Belief, Sight, Tracking, basis_of, front, rays_of, speed, step
 
 CAMERA = Camera.pinhole((90, 120), 100 / 120)
 ACCELERATION = 20.0, 8.0
@@ -141,11 +141,18 @@ def drift(scene, state, i):
     return speed(State(true.pose, wrong), scene.plane, rays_of(scene.camera), scene.focal) * scene.windows[i].duration.item()
 
 
+def seen(m, before, window):
+    """What one camera sees of its map."""
+    return [Sight.of(m, before.state, window.duration.double())]
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_step_recovers_a_perturbed_state(poster, seed):
     for i in (9, 16):
         before = perturbed(poster, i, seed)
-        found = step(poster.windows[i], Canvas.around(poster.camera), before, [others(poster, i)], Tracking())
+        found = step(
+            poster.windows[i], Canvas.around(poster.camera), before, seen(others(poster, i), before, poster.windows[i]), Tracking()
+        )
         assert error(poster, before.state, i) > 3
         assert error(poster, found.after.state, i) < 0.15
         assert found.match.strength[0] > 0.3
@@ -155,7 +162,9 @@ def test_a_step_recovers_a_perturbed_state(poster, seed):
 
 def test_a_step_makes_the_belief_more_certain(poster):
     before = perturbed(poster, 9, 0)
-    after = step(poster.windows[9], Canvas.around(poster.camera), before, [others(poster, 9)], Tracking()).after
+    after = step(
+        poster.windows[9], Canvas.around(poster.camera), before, seen(others(poster, 9), before, poster.windows[9]), Tracking()
+    ).after
     assert torch.equal(after.time, before.time)
     assert torch.equal(after.covariance, after.covariance.mT)
     assert float(torch.linalg.eigvalsh(after.covariance[0]).min()) > 0
@@ -168,9 +177,10 @@ def test_cameras_in_one_step_are_each_as_alone(poster):
     maps = [others(poster, i) for i in which]
     beliefs = [perturbed(poster, i, 0, 1.0) for i in which]
     windows = [poster.windows[i] for i in which]
-    together = step(type(windows[0]).join(windows), canvas, Belief.join(beliefs), maps, Tracking())
-    for row, (window, before, m) in enumerate(zip(windows, beliefs, maps, strict=True)):
-        alone = step(window, canvas, before, [m], Tracking())
+    sights = [seen(m, before, window)[0] for m, before, window in zip(maps, beliefs, windows, strict=True)]
+    together = step(type(windows[0]).join(windows), canvas, Belief.join(beliefs), sights, Tracking())
+    for row, (window, before, sight) in enumerate(zip(windows, beliefs, sights, strict=True)):
+        alone = step(window, canvas, before, [sight], Tracking())
         assert torch.equal(together.after.state.pose.t[row], alone.after.state.pose.t[0])
         assert torch.equal(together.after.state.pose.R[row], alone.after.state.pose.R[0])
         assert torch.equal(together.match.strength[row], alone.match.strength[0])
@@ -182,11 +192,11 @@ def test_translation_and_rotation_never_leave_their_subspace(poster, refine, obj
     how, before = Tracking(matching=Matching(objective=objective, refine=refine)), perturbed(poster, 9, 0, 0.5)
     m, canvas = others(poster, 9), Canvas.around(poster.camera)
     before = replace(before, state=State(before.state.pose, replace(before.state.motion, omega=torch.zeros(1, 3, dtype=torch.float64))))
-    found = step(poster.windows[9], canvas, before, [m], how, "translation").after.state
+    found = step(poster.windows[9], canvas, before, seen(m, before, poster.windows[9]), how, "translation").after.state
     torch.testing.assert_close(found.pose.R, before.state.pose.R, rtol=0, atol=1e-14)
     assert torch.equal(found.motion.omega, before.state.motion.omega)
     assert not torch.equal(found.pose.t, before.state.pose.t)
-    found = step(poster.windows[9], canvas, before, [m], how, "rotation").after.state
+    found = step(poster.windows[9], canvas, before, seen(m, before, poster.windows[9]), how, "rotation").after.state
     torch.testing.assert_close(found.pose.t, before.state.pose.t, rtol=0, atol=1e-14)
     assert torch.equal(found.motion.velocity, before.state.motion.velocity)
     assert float(so3.log(before.state.pose.R.mT @ found.pose.R).norm()) > 0
@@ -205,11 +215,10 @@ def test_the_front_end_sharpens_a_window_with_what_the_model_has(poster, name):
         assert not found.motion.velocity.any()
 
 
-def test_a_camera_that_looks_along_its_plane_is_an_error(poster):
-    m, window = map_of(poster.camera, wall()), poster.windows[0]
-    along = Belief(middle_of(window), state_of((0.0, 1.5, 0.0)), torch.eye(SIZE, dtype=torch.float64)[None])
-    with pytest.raises(ValueError, match="looks along its plane"):
-        step(window, Canvas.around(poster.camera), along, [m], Tracking())
+def test_a_camera_that_looks_along_its_plane_sees_nothing_of_it(poster):
+    m, seconds = map_of(poster.camera, wall()), poster.windows[0].duration.double()
+    assert Sight.of(m, state_of((0.0, 1.5, 0.0)), seconds) is None
+    assert Sight.of(m, state_of((0.0, 0.0, 0.0)), seconds) is not None
 
 
 @pytest.mark.parametrize(

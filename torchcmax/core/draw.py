@@ -63,6 +63,14 @@ class Ink:
         index = (torch.arange(count, device=events.device) * events).div(count, rounding_mode="floor")
         return Ink(*(getattr(self, f.name).gather(-1, index) for f in fields(self)))
 
+    def warped(self, H_k: Tensor) -> Tensor:
+        """All events as rays of the reference camera, by Horner's scheme: H_k [W, K, 3, 3] -> [W, N, 3] in its precision."""
+        ray, s = self.ray.to(H_k), self.s.to(H_k)[:, None]
+        total = H_k[:, -1] @ ray
+        for k in range(H_k.shape[1] - 2, -1, -1):
+            total = torch.addcmul(H_k[:, k] @ ray, total, s)
+        return total.mT
+
     @cached_property
     def ray(self) -> Tensor:
         """[W, 3, N]"""

@@ -13,7 +13,9 @@ from torchcmax.core import so3
 from torchcmax.core.camera import NEAREST, Canvas
 from torchcmax.core.contrast import CONTRASTS, blur, normalized
 from torchcmax.core.draw import Ink, draw_sum
+from torchcmax.core.match import units
 from torchcmax.core.minimize import Stop, minimize
+from torchcmax.core.objective import ContrastName
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import CLOSEST, State
@@ -27,7 +29,7 @@ LARGEST = 2048  # px: no common image is wider or higher
 class Joint:
     """How windows are optimized together."""
 
-    contrast: str = "gradient_magnitude"
+    contrast: ContrastName = "gradient_magnitude"
     """The measure of sharpness."""
     sigma: float = 1.0
     """px of blur of the common image."""
@@ -39,20 +41,28 @@ class Joint:
     """Weight of that guard, in log contrast per (log area)^2."""
     acceleration: tuple[float, float] = (20.0, 8.0)
     """What the motion may change by from window to window: rad/s^2 and plane distances/s^2, one sigma."""
-    free: tuple[bool, bool] = (True, True)
-    """Whether angular velocity and velocity are sought, or stay as they are."""
     steady: float = 0.03
     """Weight of such changes, in log contrast per square of a sigma: it decides where the windows do not."""
+
+    def __post_init__(self) -> None:
+        if self.contrast not in CONTRASTS:
+            raise ValueError(f"{self.contrast!r} is none of {', '.join(CONTRASTS)}")
+        if not (self.sigma >= 0 and self.deformation > 1 and min(self.guard, self.steady) >= 0 and min(self.acceleration) > 0):
+            raise ValueError(f"joint wants sigma, guard and steady of at least 0, a deformation above 1, accelerations above 0, got {self}")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Windows that share a plane.  state [F]: their middles | seconds [F] | ink [F, N] | plane [1]"""
+    """Windows that share a plane.  state [F]: their middles | seconds [F] | ink [F, N] | plane [1]
+
+    free: whether their angular velocities and velocities are sought, or stay as they are
+    """
 
     state: State
     seconds: Tensor
     ink: Ink
     plane: Plane
+    free: tuple[bool, bool] = (True, True)
 
     def __len__(self) -> int:
         return len(self.seconds)
@@ -61,27 +71,21 @@ class Frames:
 Way = Callable[[Tensor], State]
 """Numbers x [M] px -> the states of all frames [F]."""
 Whiten = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""y -> x, tilt: one unit of y moves the events by about 1 px rms."""
+"""y -> x, tilt: one unit of y moves the events by about 1 px rms along each axis of the image."""
 
 
-def units(frames: Frames, focal: float) -> Tensor:
-    """What moves the image by about one px: [F, 12], as core.match.units."""
-    one, away = torch.ones_like(frames.seconds) / focal, frames.state.seen(frames.plane).distance / focal
-    return torch.stack([one, away, one / frames.seconds, away / frames.seconds], -1).repeat_interleave(3, -1)
-
-
-def rates(frames: Frames, focal: float, free: tuple[bool, bool]) -> Tensor:
+def rates(frames: Frames, focal: float) -> Tensor:
     """What one px is of the angular velocity and the velocity of each frame, nothing where they are not sought: [F, 6]."""
-    sought = torch.tensor([free[0]] * 3 + [free[1]] * 3, device=frames.seconds.device)
-    return units(frames, focal)[:, 6:] * sought
+    sought = torch.tensor(frames.free, device=frames.seconds.device).repeat_interleave(3)
+    return units(frames.state, frames.plane, frames.seconds, focal)[:, 6:12] * sought
 
 
-def chained(frames: Frames, focal: float, middle: int, free: tuple[bool, bool] = (True, True)) -> Way:
+def chained(frames: Frames, focal: float, middle: int) -> Way:
     """Angular velocity and velocity of each frame, x [F * 6]; the poses follow from them, from the middle frame on.
 
     One window begins where the last one ends.
     """
-    scale = rates(frames, focal, free)
+    scale = rates(frames, focal)
 
     def states(x: Tensor) -> State:
         step = x.view(-1, 6) * scale
@@ -119,13 +123,12 @@ def onto(states: State, plane: Plane, seconds: Tensor, eye: Pose) -> Tensor:
     """
     normal, distance = plane.normal[0], plane.distance[0]
     seen = eye.R[0].mT @ (distance * torch.eye(3).to(normal) + eye.t[0][:, None] * normal)
-    many = Plane(normal.expand(len(seconds), 3), distance.expand(len(seconds)))
-    return seen @ states.homography(many, seconds)
+    return seen @ states.homography(plane.repeated(len(seconds)), seconds)
 
 
 def canvas_of(H_k: Tensor, ink: Ink, focal: float, margin: float = 0.15) -> Canvas:
     """An image plane that holds all warped events, with a margin as a share of its size."""
-    ray = rays_of(H_k, ink)[ink.weight != 0]
+    ray = ink.warped(H_k)[ink.weight != 0]
     ray = ray[ray[:, 2] > NEAREST]
     xy = ray[:, :2] / ray[:, 2:] * focal
     low, high = (xy.nan_to_num(0.0).quantile(q, dim=0) for q in (0.005, 0.995))
@@ -153,7 +156,7 @@ class Common:
         return self.way(x), tilted(self.frames.plane, tilt)
 
     def cost(self, y: Tensor) -> Tensor:
-        """-log contrast + guard."""
+        """-log contrast + guard + changes of the motion."""
         states, plane = self.at(y)
         H_k = onto(states, plane, self.frames.seconds, self.eye)
         ink = self.frames.ink
@@ -186,23 +189,14 @@ def areas(H_k: Tensor) -> Tensor:
     return torch.stack(logs, 1)
 
 
-def rays_of(H_k: Tensor, ink: Ink) -> Tensor:
-    """Warped rays: H_k [F, K, 3, 3] | ink [F, N] -> [F, N, 3]."""
-    ray, s = ink.ray.to(H_k), ink.s.to(H_k)[:, None]
-    total = H_k[:, -1] @ ray
-    for k in range(H_k.shape[1] - 2, -1, -1):
-        total = total * s + H_k[:, k] @ ray
-    return total.mT
-
-
-def whitened_chain(frames: Frames, focal: float, eye: Pose, middle: int, free: tuple[bool, bool] = (True, True)) -> Whiten:
+def whitened_chain(frames: Frames, focal: float, eye: Pose, middle: int) -> Whiten:
     """The whole metric, as each window moves all those after it: y [F * 6 + 2] -> x, tilt."""
     count, some = len(frames), frames.ink.sample(SAMPLES)
     state = chained(frames, focal, middle)(frames.seconds.new_zeros(6 * count))
-    follows = following(replace(frames, state=state), rates(frames, focal, free), middle)  # [F, 12, F * 6]
+    follows = following(replace(frames, state=state), rates(frames, focal), middle)  # [F, 12, F * 6]
 
     def pixels(step: Tensor, tilt: Tensor) -> Tensor:
-        ray = rays_of(onto(state.moved(step), tilted(frames.plane, tilt), frames.seconds, eye), some)
+        ray = some.warped(onto(state.moved(step), tilted(frames.plane, tilt), frames.seconds, eye))
         return (ray[..., :2] / ray[..., 2:].clamp_min(NEAREST) * focal).flatten(1)
 
     rest, flat, sides = torch.zeros_like(follows[:, :, 0]), frames.seconds.new_zeros(2), 1e-5 * torch.eye(12).to(follows)
@@ -264,7 +258,7 @@ def tilted(plane: Plane, tilt: Tensor) -> Plane:
 
 @dataclass(frozen=True)
 class Solved:
-    """Frames after their optimization; contrast of the common image before and after; evaluations; y: how far each number went."""
+    """Frames after their optimization | before, contrast: of the common image, less guard and changes of the motion | evaluations"""
 
     frames: Frames
     before: float
@@ -292,10 +286,10 @@ def optimize(common: Common, count: int) -> Solved:
 
 def optimize_chain(frames: Frames, focal: float, how: Joint, middle: int) -> Solved:
     """Motions and plane of consecutive windows, seen from the middle one: 6 F + 2 numbers."""
-    way, eye = chained(frames, focal, middle, how.free), frames.state.pose[middle : middle + 1]
+    way, eye = chained(frames, focal, middle), frames.state.pose[middle : middle + 1]
     with torch.no_grad():
         states = way(frames.seconds.new_zeros(6 * len(frames)))
         H_k = onto(states, frames.plane, frames.seconds, eye)
         canvas = canvas_of(H_k, frames.ink.sample(SAMPLES), focal)
-        whiten = whitened_chain(frames, focal, eye, middle, how.free)
+        whiten = whitened_chain(frames, focal, eye, middle)
     return optimize(Common(frames, way, eye, canvas, how, whiten, areas(H_k)), 6 * len(frames) + 2)

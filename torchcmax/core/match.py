@@ -42,6 +42,13 @@ class Matching:
     stop: Stop = field(default_factory=lambda: Stop(tolerance=0.02, iterations=12, longest=5.0))
     """When it is done, px of the events' motion on the map."""
 
+    def __post_init__(self) -> None:
+        for value, known in ((self.objective, ("lookup", "variance")), (self.refine, ("full", "motion"))):
+            if value not in known:
+                raise ValueError(f"{value!r} is none of {', '.join(known)}")
+        if not (self.weight > 0 and self.every >= 1):
+            raise ValueError(f"matching wants a weight above 0 and every of at least 1, got {self.weight}, {self.every}")
+
     def coarse(self, sigma: float) -> Matching:
         """For a map that is blurred by sigma px, from which another search goes on."""
         return replace(self, stop=replace(self.stop, tolerance=self.stop.tolerance * max(1.0, COARSE * sigma)))

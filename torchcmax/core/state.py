@@ -55,7 +55,7 @@ class State:
     def stepping(self, dt: Tensor) -> Tensor:
         """How a small step now is a small step dt [B] s later: F [B, 12, 12] with `later` moved by F p for `moved` by p.
 
-        To first order in p; of the turn's derivative by the angular velocity to first order in the angle, as eq. (A.8).
+        To first order in p, as eq. (A.8).
         """
         back = so3.exp(-self.motion.omega * dt[:, None])
         gain = dt[:, None, None]
@@ -67,7 +67,7 @@ class State:
         F[:, 3:6, 9:] = back * gain
         F[:, 6:9, 6:9] = torch.eye(3, dtype=back.dtype, device=back.device)
         F[:, 9:, 9:] = back
-        F[:, 9:, 6:9] = so3.hat((back @ self.motion.velocity[..., None])[..., 0]) * gain
+        F[:, 9:, 6:9] = so3.hat((back @ self.motion.velocity[..., None])[..., 0]) @ F[:, :3, 6:9]
         return F
 
     def seen(self, plane: Plane) -> Plane:

@@ -53,7 +53,7 @@ class Stream:
         """The next window, and goes past it: see `look`."""
         window = self.look(events, seconds)
         if window is not None:
-            self._skip(window.ray.shape[1])
+            self.skip(window.ray.shape[1])
         return window
 
     def look(self, events: int, seconds: float) -> Window | None:
@@ -124,8 +124,11 @@ class Stream:
             count += len(parts[-1])
         return parts[0] if len(parts) == 1 else Events.join(parts or [_nothing()])
 
-    def _skip(self, count: int) -> None:
-        """Goes past events in hand."""
+    def skip(self, events: int) -> None:
+        """Goes past so many events of those that were last looked at; ValueError where there are not as many."""
+        count = events
+        if not 1 <= count <= sum(map(len, self._parts)):
+            raise ValueError(f"only events that were looked at can be skipped, {sum(map(len, self._parts))} at most, got {count}")
         self.consumed += count
         while len(self._parts[0]) < count:
             count -= len(self._parts.popleft())

@@ -189,13 +189,18 @@ def smooth(x: Tensor, sigma: float) -> Tensor:
     """`core.contrast.blur`: image [B, H, W] | sigma px -> [B, H, W]."""
     taps = _taps(float(sigma), x.dtype)
     height, width = x.shape[1:]
-    framed, result = _array(torch.nn.functional.pad(x, (1, 1, 1, 1))), np.zeros((len(x), height + 2, width + 2), taps.dtype)
+    frames, result = _array(framed(x)), np.zeros((len(x), height + 2, width + 2), taps.dtype)
 
     def work(i: int) -> None:
-        image.blur(framed[i], taps, np.zeros(width + 2 * len(taps), taps.dtype), result[i], (0, height + 2))
+        image.blur(frames[i], taps, np.zeros(width + 2 * len(taps), taps.dtype), result[i], (0, height + 2))
 
     _spread(work, [(i,) for i in range(len(x))])
     return torch.from_numpy(result[:, 1:-1, 1:-1]).contiguous()
+
+
+def framed(x: Tensor) -> Tensor:
+    """Images with a border of nothing: [B, H, W] -> [B, H + 2, W + 2]."""
+    return torch.nn.functional.pad(x, (1, 1, 1, 1))
 
 
 def _limits(stop: Any) -> searching.Stop:
@@ -304,9 +309,7 @@ def match(q: Tensor, task: Any, how: Any, ridge: float, closest: float, terms: i
     limits, weight = _limits(how.stop), float(how.weight * how.every)
     like = task.ink.x
     texture = _array(chart.frame.to(like)).reshape(len(chart.texture), -1)
-    ground = (
-        texture if task.ground is None else _array(torch.nn.functional.pad(task.ground.to(like), (1, 1, 1, 1))).reshape(len(texture), -1)
-    )
+    ground = texture if task.ground is None else _array(framed(task.ground.to(like))).reshape(len(texture), -1)
     lens = _flat_lens(chart.focal, tuple(chart.texture.shape[1:]), like.dtype)
     places, found = _places(task, closest), [None] * len(q)
 
@@ -323,17 +326,8 @@ def match(q: Tensor, task: Any, how: Any, ridge: float, closest: float, terms: i
 def _places(task: Any, closest: float) -> Callable[[int], placing.Place]:
     """Where the rows of a task are, in numbers."""
     state, plane, chart = task.predicted, task.plane, task.chart
-    tensors = (
-        state.pose.R,
-        state.pose.t,
-        state.motion.omega,
-        state.motion.velocity,
-        plane.normal,
-        plane.across(),
-        plane.distance,
-        chart.view,
-        chart.corner,
-    )
+    where = state.pose.R, state.pose.t, state.motion.omega, state.motion.velocity
+    tensors = *where, plane.normal, plane.across(), plane.distance, chart.view, chart.corner
     R, t, omega, velocity, normal, across, distance, view, corner = (_array(part.double()) for part in tensors)
     seconds, focal = _array(task.seconds.double()), float(chart.focal)
 

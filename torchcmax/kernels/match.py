@@ -27,6 +27,15 @@ def lookup(pixel, share, stride, frame, strength):
 
 
 @compiled
+def meet(near, s_0, x, y, s, weight, lens, frame, ray, share, pixel, strength):
+    """What the events of a block find: strength [n], and in share [3, n] its slope along the coordinates of their rays."""
+    carry(near, s_0, x, y, s, ray)
+    land(ray, weight, lens, pixel, share)
+    lookup(pixel[: len(x)], share, np.int64(lens[5]), frame, strength)
+    leave(share, ray, len(x), lens)
+
+
+@compiled
 def crossed(slope, share, x, y, sums):
     """Sums over events of share slope_a slope_b times (x x, x y, x, y y, y, 1), a <= b: sums [6, 6]."""
     row = 0
@@ -75,7 +84,7 @@ def add_curvature(D, Q, half, A):
 def value_and_slope(x, u, place, events, lens, frame, terms, most, edge):
     """-sum(T - T^2 / 2) over the events, or sum F where they are none, its derivative to x [14] px, and sum T: core.match.evaluate."""
     ex, ey, es, weight = events
-    last, stride, one = count(weight), np.int64(lens[5]), lens.dtype.type(1)
+    last, one = count(weight), lens.dtype.type(1)
     if last == 0:
         return 0.0, np.zeros(SIZE), 0.0
     exact = np.empty((terms, 3, 3))
@@ -89,10 +98,7 @@ def value_and_slope(x, u, place, events, lens, frame, terms, most, edge):
         n = end - i
         size = min(BLOCK, 2 * n)
         expand(H, s_0, near)
-        carry(near, s_0, ex[i:end], ey[i:end], es[i:end], ray)
-        land(ray, weight[i:end], lens, pixel, share)
-        lookup(pixel[:n], share, stride, frame, strength)
-        leave(share, ray, n, lens)
+        meet(near, s_0, ex[i:end], ey[i:end], es[i:end], weight[i:end], lens, frame, ray, share, pixel, strength)
         part, all_of = lens.dtype.type(0), lens.dtype.type(0)
         for j in range(n):
             all_of += strength[j]
@@ -114,7 +120,7 @@ def value_and_slope(x, u, place, events, lens, frame, terms, most, edge):
 def curvature(x, u, place, events, lens, frame, terms):
     """What the second derivative of -sum(T - T^2 / 2) is expected to be: [14, 14], core.match.curvature."""
     ex, ey, es, weight = events
-    last, stride, one, least = count(weight), np.int64(lens[5]), lens.dtype.type(1), lens.dtype.type(LEAST)
+    last, one, least = count(weight), lens.dtype.type(1), lens.dtype.type(LEAST)
     exact, dH = np.empty((terms, 3, 3)), derivatives(x, u, place, terms)
     placed(x, u, place, exact)
     H = exact.astype(lens.dtype)
@@ -127,10 +133,7 @@ def curvature(x, u, place, events, lens, frame, terms):
         n = end - i
         size = min(BLOCK, 2 * n)
         expand(H, s_0, near)
-        carry(near, s_0, ex[i:end], ey[i:end], es[i:end], ray)
-        land(ray, weight[i:end], lens, pixel, share)
-        lookup(pixel[:n], share, stride, frame, strength)
-        leave(share, ray, n, lens)
+        meet(near, s_0, ex[i:end], ey[i:end], es[i:end], weight[i:end], lens, frame, ray, share, pixel, strength)
         for j in range(n):
             strength[j] = one / (strength[j] + least)
         crossed(share, strength, ex[i:end], ey[i:end], sums)

@@ -139,9 +139,9 @@ class Map:
             self._area = Area(box, layers, self.charts(layers, box, self.texture.blur))
         return self._area
 
-    def charts(self, layers: Layers, box: Box, blurs: tuple[float, ...]) -> tuple[Chart, ...]:
-        """What windows are matched to, for several blurs."""
-        strength = self.strength(layers)[None]
+    def charts(self, layers: Layers, box: Box, blurs: tuple[float, ...], typical: float | None = None) -> tuple[Chart, ...]:
+        """What windows are matched to, for several blurs; typical: as `strength`."""
+        strength = self.strength(layers, typical)[None]
         corner = torch.tensor([box.corner], dtype=torch.float64, device=strength.device)
         return tuple(Chart(blur(strength, sigma), corner, self.view, self.focal) for sigma in blurs)
 
@@ -152,13 +152,13 @@ class Map:
         """
         return layers.votes * spread(1 / layers.most.clamp_min(self.texture.least))
 
-    def strength(self, layers: Layers) -> Tensor:
-        """The rate, saturated: r / (r + r_0), in 0..1, with the rate r_0 that an event meets on average, sum r^2 / sum r."""
+    def strength(self, layers: Layers, typical: float | None = None) -> Tensor:
+        """The rate, saturated: r / (r + r_0), in 0..1, with the typical rate r_0 of an edge; default: that of this map."""
         rate = self.rate(layers)
-        return rate / (rate + max(self.typical(), 1e-9))
+        return rate / (rate + max(self.typical() if typical is None else typical, 1e-9))
 
     def typical(self) -> float:
-        """sum r^2 / sum r over the map."""
+        """The rate that an event meets on average: sum r^2 / sum r over the map."""
         stale = [name for name in self.tiles if name not in self._sums]
         if stale:
             votes, exposure = (torch.stack([getattr(self.tiles[name], layer) for name in stale]) for layer in ("votes", "exposure"))
@@ -248,21 +248,16 @@ class Map:
 
         Else a window is drawn away from the border of what is known, where strength fades.
         """
-        column, row, inside = places(self._moved(ink, H_k), area.box)
+        column, row, inside = places(self.pixels(ink, H_k), area.box)
         strange = (area.layers.most < self.texture.exposure / 2).to(ink.x)
         near = max_pool2d(strange[None], 3, 1, 1)[0]
         return replace(ink, weight=ink.weight * (inside & (near[row // CELL, column // CELL] == 0)))
 
-    def _moved(self, ink: Ink, H_k: Tensor) -> Tensor:
+    def pixels(self, ink: Ink, H_k: Tensor) -> Tensor:
         """Events [1, N] on the map, [N, 2] px."""
-        H_k = H_k.to(ink.x)
-        s, ray = ink.s[0], torch.stack([ink.x[0], ink.y[0], torch.ones_like(ink.x[0])])
-        moved = H_k[-1] @ ray
-        for k in range(len(H_k) - 2, -1, -1):
-            moved = torch.addcmul(H_k[k] @ ray, moved, s)
-        return flat(moved.T, self.focal)
+        return flat(ink.warped(H_k[None].to(ink.x))[0], self.focal)
 
-    def by_chance(self, ink: Ink, chart: Chart, H_k: Tensor, area: Area) -> tuple[Ink, Tensor]:
+    def by_chance(self, ink: Ink, H_k: Tensor, area: Area) -> tuple[Ink, Tensor]:
         """Where events of a window could be, evenly over sensor and time, as many as there are; and what they would bring, [1, H, W].
 
         The sum of what events find grows when they are drawn together onto strong edges, whatever the motion.  Events that fall
@@ -273,8 +268,8 @@ class Map:
         x, y, s = (part.permute(2, 0, 1).reshape(1, -1).to(ink.x) for part in torch.meshgrid(*steps, indexing="ij"))
         x, y = low[0] + x * (high[0] - low[0]), low[1] + y * (high[1] - low[1])
         points = self.trusted(Ink(x, y, (s - 0.5).contiguous(), torch.ones_like(x)), H_k, area)
-        T = chart.texture
+        T = area.charts[-1].texture
         ground, rate = (blur(avg_pool2d(part, CELL), 1.5)[0] for part in (T.square() / 2, T / (1 - T).clamp_min(0.05)))
-        column, row, _ = places(self._moved(points, H_k), area.box)
+        column, row, _ = places(self.pixels(points, H_k), area.box)
         expected = (rate[row // CELL, column // CELL] * points.weight[0]).sum()
         return replace(points, weight=points.weight * (ink.weight.sum() / expected.clamp_min(1e-9))), spread(ground)[None]

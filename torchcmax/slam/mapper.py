@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchcmax.core.draw import Ink
 from torchcmax.core.joint import Frames, Joint, Solved, optimize_chain
-from torchcmax.core.match import NUMBERS, Match, Matching, Task, match, units
+from torchcmax.core.match import NUMBERS, Match, Matching, Task, lookup, match, units
 from torchcmax.core.model import Displacement
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
@@ -20,9 +20,13 @@ from torchcmax.core.window import Window
 from torchcmax.slam.map import Area, Map
 from torchcmax.slam.tracker import SOME
 
-RIVAL = 4  # every so-manieth event is enough to tell the twin plane
+ROUGH = 10.0  # tolerances that are enough to tell the twin plane
+WORSE = 0.95  # share of what the newest keyframe met in the image of the others that it must meet after a joint optimization
 MOST_TILT = 0.05  # rad in a round
 LOOSE = 5.0, 2.0  # px: how far the pose and the motion of a keyframe go in a round, one sigma
+
+
+Free = tuple[bool, bool]
 
 
 @dataclass(frozen=True)
@@ -52,32 +56,39 @@ class Mapping:
     doubt: float = 10.0
     """How many times less certain the plane is than its events say, as what biases it is the same in all of them."""
 
+    def __post_init__(self) -> None:
+        least = {"first": 1, "thinned": 2, "every": 1, "last": 1, "settle": 0, "until": 0, "final": 0}
+        wrong = [f"{name} of at least {n}, got {getattr(self, name)}" for name, n in least.items() if getattr(self, name) < n]
+        wrong += [] if 0 <= self.overlap <= 1 else [f"an overlap of 0 to 1, got {self.overlap}"]
+        wrong += [f"{name} above 0, got {getattr(self, name)}" for name in ("tilt", "doubt") if not getattr(self, name) > 0]
+        if wrong:
+            raise ValueError(f"mapping wants {wrong[0]}")
+
 
 def thinned(ink: Ink, most: int) -> Ink:
     """At most so many events of each window, evenly."""
     return ink.thinned(max(1, -(-ink.x.shape[-1] // most)))
 
 
-def first_plane(windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, tilt: Tensor | None = None) -> Solved:
+def first_plane(
+    windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, start: Plane | None = None, free: Free = (True, True)
+) -> Solved:
     """Consecutive windows before one plane, from their own motions [1] before a wall: all motions and the plane together.
 
     One window has two planes that explain it as well, the second being the first's velocity (Displacement.twin).  So from the
-    twin of what was found the search is begun once more, with a few of the events; where that ends sharper, it is the plane.
-    tilt [1, 2] rad: the plane to start from; default: the wall
+    twin of what was found the search is begun once more, less exactly; where that ends sharper, it is the plane.
+    start [1]: the plane to begin with; default: the wall | free: what the camera is known to do, as Frames
     """
-    start = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64) if tilt is None else tilt)
     count, middle = len(windows), len(windows) // 2
     inks = Ink.join([thinned(Ink.of(w, w.weight), how.thinned) for w in windows])
     seconds = torch.cat([w.duration for w in windows]).double()
     motion = Motion(torch.cat([m.omega for m in motions]), torch.cat([m.velocity for m in motions]))
     rest = Pose(torch.eye(3, dtype=torch.float64).expand(count, 3, 3), torch.zeros(count, 3, dtype=torch.float64))
-    frames = Frames(State(rest, motion), seconds, inks, start)
+    frames = Frames(State(rest, motion), seconds, inks, start or Plane.tilted(torch.zeros(1, 2, dtype=torch.float64)), free)
     found = optimize_chain(frames, focal, how.joint, middle)
-    few = inks.thinned(RIVAL)
-    rival = optimize_chain(replace(frames, ink=few, plane=twin_of(found.frames, middle)), focal, how.joint, middle)
-    if rival.contrast > optimize_chain(replace(found.frames, ink=few), focal, how.joint, middle).contrast:
-        found = optimize_chain(replace(rival.frames, ink=inks), focal, how.joint, middle)
-    return found
+    rough = replace(how.joint, stop=replace(how.joint.stop, tolerance=ROUGH * how.joint.stop.tolerance))
+    rival = optimize_chain(replace(frames, plane=twin_of(found.frames, middle)), focal, rough, middle)
+    return optimize_chain(rival.frames, focal, how.joint, middle) if rival.contrast > found.contrast else found
 
 
 def twin_of(frames: Frames, middle: int) -> Plane:
@@ -101,11 +112,14 @@ def rebased(frames: Frames) -> Frames:
 
 @dataclass(frozen=True)
 class Settled:
-    """A map after a round of joint optimization, and by how much its plane tilted, rad [2], given what is still open about it."""
+    """A map after a round of joint optimization, by how much its plane tilted, rad [2], and whether the newest keyframe is for it.
+
+    accepted: else the map is the old one
+    """
 
     map: Map
     tilt: Tensor
-    cost: float
+    accepted: bool
 
 
 def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | None = None, basis: Tensor | None = None) -> Settled:
@@ -113,6 +127,7 @@ def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | 
 
     12 k + 2 numbers; the first keyframe stays, and with it the world.  The tilt is the step that its events want, given that
     every keyframe would follow (Schur's complement), and that it was `start`, more or less.  basis [14, M]: how keyframes may move.
+    Where the newest keyframe then finds less in the image of the others than before, the old map stays.
     """
     count = len(m.keyframes)
     free = range(max(1, count - (last or count)), count)
@@ -134,8 +149,32 @@ def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | 
         keyframes[i] = keyframes[i].at(keyframes[i].state.moved(x * one.size[:, :SIZE]))
     fresh = Map(m.plane.leaning(tilt[None] / m.focal), m.focal, m.border, m.texture, number=m.number)
     fresh.draw(keyframes)
-    cost = sum(float(one.match.cost) for one in matches.values()) / max(1, len(matches))
-    return Settled(fresh, tilt / m.focal, cost)
+    if explained(fresh, count - 1, matching, m.typical()) < WORSE * explained(m, count - 1, matching, m.typical()):
+        return Settled(m, torch.zeros_like(tilt), False)
+    return Settled(fresh, tilt / m.focal, True)
+
+
+def explained(m: Map, number: int, matching: Matching, typical: float) -> float:
+    """The mean strength that a keyframe's events meet in the image of the others, where that is known; 0 where it is nowhere.
+
+    typical: the rate of an edge, the same for maps that are to be compared
+    """
+    found = among_others(m, number, typical)
+    if found is None:
+        return 0.0
+    area, H_k = found
+    few = m.trusted(m.keyframes[number].ink.thinned(matching.every), H_k, area)
+    strength = lookup(area.charts[0].texture, m.pixels(few, H_k)[None] - area.charts[0].corner.to(few.x))[0][0]
+    return float((strength * few.weight[0]).sum() / few.weight.sum().clamp_min(1))
+
+
+def among_others(m: Map, number: int, typical: float | None = None) -> tuple[Area, Tensor] | None:
+    """What all the others drew around a keyframe, and its warp H_k [K, 3, 3] there; None where it looks along the plane."""
+    own = m.drawn(number)
+    if own is None:
+        return None
+    layers = m.assembled(own.box) - own.layers
+    return Area(own.box, layers, m.charts(layers, own.box, m.texture.blur[-1:], typical)), own.H_k
 
 
 @dataclass(frozen=True)
@@ -163,16 +202,15 @@ def _placed(m: Map, number: int, matching: Matching, basis: Tensor | None) -> _P
 
 def before_others(m: Map, number: int, matching: Matching, basis: Tensor | None = None) -> Task | None:
     """A keyframe before the map of all others; None where nothing of them is in its view."""
-    basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64) if basis is None else basis
-    keyframe, own = m.keyframes[number], m.drawn(number)
-    if own is None:
+    found = among_others(m, number)
+    if found is None:
         return None
-    layers, H_k = m.assembled(own.box) - own.layers, own.H_k
-    (chart,) = m.charts(layers, own.box, m.texture.blur[-1:])
-    area = Area(own.box, layers, (chart,))
+    (area, H_k), keyframe = found, m.keyframes[number]
     few = m.trusted(keyframe.ink.thinned(matching.every), H_k, area)
     if not few.weight.any():
         return None
-    ghosts, ground = m.by_chance(few, chart, H_k, area)
+    ghosts, ground = m.by_chance(few, H_k, area)
+    basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64) if basis is None else basis
+    (chart,) = area.charts
     loose = torch.tensor([LOOSE[0] ** -2] * 6 + [LOOSE[1] ** -2] * 6 + [0.0] * 2, dtype=torch.float64)
     return Task(keyframe.state, m.plane, keyframe.seconds, chart, few, keyframe.ink.sample(SOME), loose.diag()[None], basis, ghosts, ground)

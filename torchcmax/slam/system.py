@@ -21,7 +21,7 @@ from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.slam.map import Keyframe, Map, Texture
 from torchcmax.slam.mapper import Mapping, first_plane, rebased, settled
-from torchcmax.slam.tracker import Belief, Front, ModelName, Step, Tracking, basis_of, front, rays_of, speed, step
+from torchcmax.slam.tracker import Belief, Front, ModelName, Sight, Step, Tracking, basis_of, front, rays_of, speed, step
 
 Status = Literal["start", "ok", "weak", "lost"]
 KNOWN = 0.5  # share of the usual strength below which a window is weak
@@ -38,8 +38,8 @@ class Source(Protocol):
     def look(self, events: int, seconds: float) -> Window | None:
         """The next window, without going past it; None at the end."""
 
-    def take(self, events: int, seconds: float) -> Window | None:
-        """The next window, and goes past it."""
+    def skip(self, events: int) -> None:
+        """Goes past the first events of what was last looked at."""
 
 
 @dataclass(frozen=True)
@@ -121,19 +121,22 @@ class System:
         for run, source in zip(self._runs, sources, strict=True):
             yield from run.begin(source)
         while turn := [(run, window) for run in self._runs if (window := run.next()) is not None]:
-            predictions = [(run, window, run.predicted(window)) for run, window in turn]
-            seen = [one for one in predictions if one[0].sees(*one[1:])]
-            yield from (run.hold(window) for run, window, _ in predictions if not any(run is one[0] for one in seen))
+            seen = []
+            for run, window in turn:
+                before = run.predicted(window)
+                if sight := run.sight(window, before):
+                    seen.append((run, window, before, sight))
+                else:
+                    yield run.hold(window)
             if seen:
                 found = self._step(seen)
-                yield from (run.follow(window, found, i) for i, (run, window, _) in enumerate(seen))
+                yield from (run.follow(window, found, i) for i, (run, window, _, _) in enumerate(seen))
         for run in self._runs:
             run.finish()
 
-    def _step(self, turn: Sequence[tuple[_Run, Window, Belief]]) -> Step:
-        runs, windows, before = zip(*turn, strict=True)
-        how = self.options
-        return step(Window.join(windows), self.canvas, Belief.join(before), [run.map for run in runs], how.tracking, how.model)
+    def _step(self, seen: Sequence[tuple[_Run, Window, Belief, Sight]]) -> Step:
+        _, windows, before, sights = zip(*seen, strict=True)
+        return step(Window.join(windows), self.canvas, Belief.join(before), sights, self.options.tracking, self.options.model)
 
 
 class _Run:
@@ -156,12 +159,6 @@ class _Run:
             raise ValueError("there is no map before the first plane is found")
         return self._map
 
-    @property
-    def sought(self) -> Mapping:
-        """How the first plane is found with this model."""
-        how, model = self.options.mapping, self.options.model
-        return replace(how, joint=replace(how.joint, free=(model != "translation", model != "rotation")))
-
     def window(self, state: State, plane: Plane) -> Window | None:
         """The next window: as long as the image takes to move by the displacement wanted."""
         how = self.options.tracking
@@ -169,7 +166,9 @@ class _Run:
         found = self.source.look(how.most, seconds)
         if found is not None and found.ray.shape[1] < how.fewest and seconds < how.seconds:
             found = self.source.look(how.fewest, how.seconds)
-        return None if found is None else self.source.take(found.ray.shape[1], torch.inf)
+        if found is not None:
+            self.source.skip(found.ray.shape[1])
+        return found
 
     def next(self) -> Window | None:
         return self.window(self.belief.state, self.map.plane)
@@ -183,11 +182,11 @@ class _Run:
         if self.given is not None:
             yield from self._on_map(windows, fronts)
             return
-        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, self.sought).frames)
+        how, free = self.options.mapping, (self.options.model != "translation", self.options.model != "rotation")
+        solved = rebased(first_plane(windows, [f.motion for f in fronts], self.canvas.focal, how, free=free).frames)
         self.start_plane = solved.plane
         self._map = Map(solved.plane, self.canvas.focal, self.border, self.options.texture, number=self.number)
-        for i, window in enumerate(windows):
-            self._draw(window, solved.state[i : i + 1])
+        self._map.draw([keyframe_of(window, solved.state[i : i + 1]) for i, window in enumerate(windows)])
         for _ in range(self.options.mapping.settle):
             self._settle(None)
         for i, (window, alone) in enumerate(zip(windows, fronts, strict=True)):
@@ -202,21 +201,21 @@ class _Run:
         time, found = middle_of(windows[0]), []
         for keyframe in self.map.keyframes:
             here = Belief(time, State(keyframe.state.pose, Motion(*(torch.zeros(1, 3, dtype=torch.float64) for _ in range(2)))), wide)
-            if self.sees(windows[0], here):
-                found.append(self._alone(windows[0], here))
+            if sight := self.sight(windows[0], here):
+                found.append(self._alone(windows[0], here, sight))
         if not found:
             raise ValueError("the given map has no keyframe from which its plane could be seen")
         best = max(found, key=lambda one: float(one.match.strength[0]))
         self.belief = replace(best.after, covariance=best.before.covariance)
         for window in windows:
             before = self.predicted(window)
-            if self.sees(window, before):
-                yield self.follow(window, self._alone(window, before), 0)
+            if sight := self.sight(window, before):
+                yield self.follow(window, self._alone(window, before, sight), 0)
             else:
                 yield self.hold(window)
 
-    def _alone(self, window: Window, before: Belief) -> Step:
-        return step(window, self.canvas, before, [self.map], self.options.tracking, self.options.model)
+    def _alone(self, window: Window, before: Belief, sight: Sight) -> Step:
+        return step(window, self.canvas, before, [sight], self.options.tracking, self.options.model)
 
     def _first_windows(self) -> tuple[list[Window], list[Front]]:
         """Windows and what they show alone, before a wall at distance one."""
@@ -246,9 +245,9 @@ class _Run:
         """What is known of the camera at the window's middle before it is looked at."""
         return self.belief.at(middle_of(window), self.options.tracking.acceleration)
 
-    def sees(self, window: Window, before: Belief) -> bool:
-        """Whether the camera is predicted to see its plane, and not to look along it."""
-        return self.map.box(self.map.warp(before.state, window.duration.double())) is not None
+    def sight(self, window: Window, belief: Belief) -> Sight | None:
+        """What the camera sees of the map from where it is believed to be; None where it looks along the plane."""
+        return Sight.of(self.map, belief.state, window.duration.double())
 
     def hold(self, window: Window) -> Track:
         """A window that cannot be tracked: the camera stays where it was."""
@@ -264,13 +263,14 @@ class _Run:
         """A window that was tracked: its status, and what it does to the map."""
         self.belief = found.after[row : row + 1]
         strength = float(found.match.strength[row])
-        H_k = self.map.warp(self.belief.state, window.duration.double())
-        box = self.map.box(H_k)
-        overlap = 0.0 if box is None else self.map.overlap(H_k, self.rays, self.map.area(box))
-        status = self._status(strength, int(self.belief.time[0])) if box is not None else "lost"
+        sight = self.sight(window, self.belief)
+        overlap = self.map.overlap(sight.H_k, self.rays, sight.area) if sight else 0.0
+        status = self._status(strength, int(self.belief.time[0])) if sight else "lost"
+        if status != "ok":
+            self.belief = found.before[row : row + 1]
         drawn = status == "ok" and overlap < self.options.mapping.overlap and self.given is None
         if drawn:
-            self._draw(window, self.belief.state)
+            self.map.draw([keyframe_of(window, self.belief.state)])
             self._optimize()
         evaluations = int(found.front.evaluations[row] + found.match.evaluations[row])
         return self._track(
@@ -282,12 +282,8 @@ class _Run:
             self.usual.append(strength)
             self.weak_since = None
             return "ok"
-        self.weak_since = self.weak_since or time
+        self.weak_since = time if self.weak_since is None else self.weak_since
         return "lost" if (time - self.weak_since) * 1e-6 > PATIENCE else "weak"
-
-    def _draw(self, window: Window, state: State) -> None:
-        keyframe = Keyframe(int(middle_of(window)[0]), state, window.duration.double(), Ink.of(window, window.weight))
-        self.map.draw([keyframe])
 
     def _optimize(self) -> None:
         """A joint optimization after every few new keyframes, while the map is young."""
@@ -331,6 +327,11 @@ class _Run:
         poses = [self.map.keyframes[keyframe].state.pose @ pose for _, keyframe, pose in self.hung]
         every = Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses]))
         return Trajectory(torch.tensor([time for time, _, _ in self.hung]), every)
+
+
+def keyframe_of(window: Window, state: State) -> Keyframe:
+    """A window [1] with the state of its middle, to be drawn."""
+    return Keyframe(int(middle_of(window)[0]), state, window.duration.double(), Ink.of(window, window.weight))
 
 
 def middle_of(window: Window) -> Tensor:

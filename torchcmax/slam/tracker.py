@@ -138,34 +138,44 @@ def _at_rest(look: Look, view: View, owner: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """What a camera sees of a map: the warp H_k [K, 3, 3] of a window onto it, and the area around."""
+
+    map: Map
+    H_k: Tensor
+    area: Area
+
+    @classmethod
+    def of(cls, m: Map, state: State, seconds: Tensor) -> Sight | None:
+        """From a state [1]; None where the camera looks along the plane, or away from it."""
+        H_k = m.warp(state, seconds)
+        box = m.box(H_k)
+        return None if box is None else cls(m, H_k, m.area(box))
+
+
+@dataclass(frozen=True)
 class Step:
-    """What windows gave: belief before and after them, what they show alone, where they match, the areas of the maps they met."""
+    """What windows gave: belief before and after them, what they show alone, where they match."""
 
     before: Belief
     after: Belief
     front: Front
     match: Match
-    areas: list[Area]
 
 
-def step(window: Window, canvas: Canvas, before: Belief, maps: Sequence[Map], how: Tracking, name: ModelName = "planar") -> Step:
-    """The windows [B] of cameras against their maps, from what is predicted for their middles: make sharp, match.
-
-    ValueError where a camera is predicted to look along its plane.
-    """
-    plane, seconds = Plane.join([m.plane for m in maps]), window.duration.double()
+def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight], how: Tracking, name: ModelName = "planar") -> Step:
+    """The windows [B] of cameras against what they see of their maps, from what is predicted for their middles: make sharp, match."""
+    plane, seconds = Plane.join([s.map.plane for s in sights]), window.duration.double()
     alone = front(window, canvas, before.state, plane, how, name)
     size = units(before.state, plane, seconds, canvas.focal)
-    warps = [m.warp(before.state[i : i + 1], seconds[i : i + 1]) for i, m in enumerate(maps)]
-    areas = [_area(m, H_k) for m, H_k in zip(maps, warps, strict=True)]
     basis = basis_of(name, how.matching.refine).to(size)
-    tasks = tasks_of(window, before, maps, warps, areas, how, basis)
+    tasks = tasks_of(window, before, sights, how, basis)
     q = torch.cat([torch.zeros_like(size[:, :6]), before.state.step_to(State(before.state.pose, alone.motion))[:, 6:] / size[:, 6:12]], 1)
     narrow = basis / basis.square().sum(0)  # its columns are orthogonal
     q = q @ narrow[:SIZE]
     evaluations = torch.zeros_like(alone.evaluations)
     for i, task in enumerate(tasks):
-        sigma = maps[0].texture.blur[i]
+        sigma = sights[0].map.texture.blur[i]
         found = match(q, task, how.matching if i == len(tasks) - 1 else how.matching.coarse(sigma))
         q, evaluations = found.x @ narrow, evaluations + found.evaluations
     found = replace(found, evaluations=evaluations)
@@ -173,7 +183,7 @@ def step(window: Window, canvas: Canvas, before: Belief, maps: Sequence[Map], ho
     covariance = torch.linalg.inv(torch.linalg.inv(before.covariance) + information)
     if how.matching.objective == "variance":  # it does not say how sure it is; nobody asks
         covariance = torch.eye(SIZE).to(covariance).expand_as(covariance)
-    return Step(before, Belief(before.time, found.state, (covariance + covariance.mT) / 2), alone, found, areas)
+    return Step(before, Belief(before.time, found.state, (covariance + covariance.mT) / 2), alone, found)
 
 
 def basis_of(name: ModelName, refine: str) -> Tensor:
@@ -189,25 +199,16 @@ def basis_of(name: ModelName, refine: str) -> Tensor:
     return torch.cat([rate + pose / 2 for pose, rate in zip(columns[:half], columns[half:], strict=True)], 1)
 
 
-def _area(m: Map, H_k: Tensor) -> Area:
-    box = m.box(H_k)
-    if box is None:
-        raise ValueError("the camera looks along its plane")
-    return m.area(box)
-
-
-def tasks_of(
-    window: Window, before: Belief, maps: Sequence[Map], warps: list[Tensor], areas: list[Area], how: Tracking, basis: Tensor
-) -> list[Task]:
+def tasks_of(window: Window, before: Belief, sights: Sequence[Sight], how: Tracking, basis: Tensor) -> list[Task]:
     """The windows before their maps, coarse to fine."""
-    plane, seconds = Plane.join([m.plane for m in maps]), window.duration.double()
+    plane, seconds = Plane.join([s.map.plane for s in sights]), window.duration.double()
     ink = Ink.of(window, window.weight)
     few, some = ink.thinned(how.matching.every), ink.sample(SOME)
-    known = Ink.join([m.trusted(few[i : i + 1], warps[i], areas[i]) for i, m in enumerate(maps)])
-    size = units(before.state, plane, seconds, maps[0].focal)[:, :SIZE]
+    known = Ink.join([s.map.trusted(few[i : i + 1], s.H_k, s.area) for i, s in enumerate(sights)])
+    size = units(before.state, plane, seconds, sights[0].map.focal)[:, :SIZE]
     prior = pad(torch.linalg.inv(before.covariance) * (size[:, :, None] * size[:, None]), (0, 2, 0, 2))
-    charts = [Chart.join(level) for level in zip(*(area.charts for area in areas), strict=True)]
+    charts = [Chart.join(level) for level in zip(*(s.area.charts for s in sights), strict=True)]
     if how.matching.objective == "lookup":
         return [Task(before.state, plane, seconds, chart, known, some, prior, basis) for chart in charts]
-    votes = charts[-1].filled([area.layers.votes for area in areas])
-    return [Task(before.state, plane, seconds, charts[-1], ink.thinned(how.matching.every), some, prior, basis, votes=votes)]
+    votes = charts[-1].filled([s.area.layers.votes for s in sights])
+    return [Task(before.state, plane, seconds, charts[-1], few, some, prior, basis, votes=votes)]
