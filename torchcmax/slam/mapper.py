@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from torchcmax import kernels
 from torch import Tensor
 
 from torchcmax.core.draw import Ink
@@ -132,7 +134,9 @@ def settled(m: Map, start: Plane, how: Mapping, matching: Matching, last: int | 
     count = len(m.keyframes)
     free = range(max(1, count - (last or count)), count)
     matching = replace(matching, objective="lookup")
-    found = {i: _placed(m, i, matching, basis) for i in free}
+    m.typical()  # now, as the threads share it
+    with ThreadPoolExecutor(kernels.threads()) as pool:
+        found = dict(zip(free, pool.map(lambda i: _placed(m, i, matching, basis), free), strict=True))
     matches = {i: one for i, one in found.items() if one is not None}
     normal, push = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     for one in matches.values():
