@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import torch
-from torchcmax import kernels
 from torch import Tensor
 
+from torchcmax import kernels
 from torchcmax.core.draw import Ink
 from torchcmax.core.joint import Frames, Joint, Solved, optimize_chain
 from torchcmax.core.match import NUMBERS, Match, Matching, Task, lookup, match, units
