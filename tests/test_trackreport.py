@@ -67,7 +67,8 @@ def test_all_that_is_promised_is_there_and_nothing_else(run):
 
 def test_windows_csv_has_the_columns_of_compensate_and_its_own(run):
     header = (run.folder / WINDOWS).read_text().splitlines()[0]
-    assert header == ",".join(COLUMNS) + ",time_us,tx,ty,tz,qx,qy,qz,qw,status,overlap,strength,map,keyframe"
+    signs = "status,reason,overlap,strength,supported,doubt,weakest,weakest_share"
+    assert header == ",".join(COLUMNS) + f",time_us,tx,ty,tz,qx,qy,qz,qw,{signs},map,keyframe"
     lines = lines_of(run.folder / WINDOWS)
     assert [int(line["index"]) for line in lines] == list(range(len(lines)))
     assert len(lines) > 7

@@ -225,7 +225,10 @@ def run_track(config: Namespace) -> int:
 def told(report: TrackReport) -> str:
     """The run in a few words."""
     found, error = report.summary(), report.error
-    words = f"{found['windows']} windows, {found['keyframes']} keyframes, {found['lost_seconds']:g} s lost, {report.factor:.2f}x real time"
+    lost = f"{found['lost_seconds']:g} s lost" + (
+        f" ({found['losses']} times, found again {found['recoveries']})" if found["losses"] else ""
+    )
+    words = f"{found['windows']} windows, {found['keyframes']} keyframes, {lost}, {report.factor:.2f}x real time"
     if error is None:
         return words
     parts = [] if error["percent_of_distance"] is None else [f"{error['percent_of_distance']:.3f} % of the plane's distance"]

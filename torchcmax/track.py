@@ -15,7 +15,7 @@ from torchcmax.core.window import Window
 from torchcmax.io import DataError, Recording
 from torchcmax.mapfile import load_map
 from torchcmax.slam.map import Map
-from torchcmax.slam.system import Slam, System, Track
+from torchcmax.slam.system import Placement, Slam, System, Track
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,40 @@ class Tracks:
         return self.system.maps[0]
 
     @property
+    def atlas(self) -> list[Map]:
+        """All maps that were not joined, the main one first."""
+        return self.system.atlas(0)
+
+    @property
+    def placements(self) -> list[Placement]:
+        """Where each window belongs, as is known now, one for each track."""
+        return self.system.placements(0)
+
+    @property
+    def losses(self) -> int:
+        """How often the camera was lost."""
+        return self.system.runs[0].losses
+
+    @property
+    def recoveries(self) -> int:
+        """How often it was found again in the map."""
+        return self.system.runs[0].recoveries
+
+    @property
+    def joins(self) -> int:
+        """How many maps, begun while it was lost, became part of the main one."""
+        return self.system.runs[0].joins
+
+    @property
     def unit(self) -> float:
         """What positions are to be multiplied with to be in metres, or, where no distance is given, 1."""
         return 1.0 if self.options.distance is None else self.options.distance
 
     def trajectory(self) -> Trajectory:
-        """Poses T_wc at the middles of all windows so far, as they are now, in plane distances: float64; at least two windows."""
+        """Poses T_wc at the middles of the windows so far that belong to the main map, as they are now, in plane distances: float64.
+
+        ValueError where there are fewer than two.
+        """
         return self.system.trajectory(0)
 
 

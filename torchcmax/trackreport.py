@@ -7,6 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,10 +30,10 @@ from torchcmax.mapimage import picture
 from torchcmax.picture import captioned, pictures, png
 from torchcmax.slam.system import Track
 from torchcmax.track import Tracks, in_metres
-from torchcmax.tracktable import KEYFRAMES, POSE, TABLE, Row, cells, keyframe_rows, row, set_poses, write_table
+from torchcmax.tracktable import KEYFRAMES, POSE, SIGNS, TABLE, Row, cells, keyframe_rows, row, set_placements, set_poses, write_table
 
-SHOWN = [*COLUMNS[4:], "overlap", "strength"]  # of the table, on the board
-STATUS = {"ok": 0.0, "weak": 1.0, "lost": 2.0, "start": 3.0}
+SHOWN = [*COLUMNS[4:], *(name for name in SIGNS if name != "weakest")]  # of the table, on the board
+STATUS = {"ok": 0.0, "weak": 1.0, "lost": 2.0, "start": 3.0, "still": 4.0}
 RUNNING = "it is still running, or was killed"
 SHOW = 1.0  # s between moments at which what is done can be seen
 SMALL = 1024  # px of the map on the board
@@ -147,7 +148,9 @@ class TrackReport:
         board.image("map", png(page), page.shape[:2], step)
 
     def _positions(self) -> Tensor:
-        return torch.tensor([[line[name] for name in POSE[:3]] for line in self.table], dtype=torch.float64).view(-1, 3)
+        number = self.tracks.map.number
+        here = [[line[name] for name in POSE[:3]] for line in self.table if line["map"] == number and line["status"] != "lost"]
+        return torch.tensor(here, dtype=torch.float64).view(-1, 3)
 
     def _title(self) -> str:
         return f"map of {self.tracks.recording.name}, {len(self.tracks.map.keyframes)} keyframes"
@@ -165,7 +168,7 @@ class TrackReport:
     def _finish(self, board: Board, stopped: str | None) -> None:
         """Writes all that there is, whatever of it cannot be written."""
         self._attempt(lambda: self._show(board))
-        trajectory = self._settle() if len(self.table) > 1 else None
+        trajectory = self._settle()
         self._attempt(lambda: self._show_end(board))
         for name, write in self._outputs(trajectory).items():
             self._attempt(write, name)
@@ -180,12 +183,17 @@ class TrackReport:
         except (OSError, DataError) as error:
             self.failed = self.failed or error
 
-    def _settle(self) -> Trajectory:
-        """The final poses, also into the table, and their errors."""
-        trajectory = self.tracks.trajectory()
-        count = len(self.table)  # where a run was broken off, a window may not have come here
-        trajectory = Trajectory(trajectory.time[:count].cpu(), on_cpu(trajectory.pose[:count]))
-        set_poses(self.table, trajectory.pose)
+    def _settle(self) -> Trajectory | None:
+        """The final poses, also into the table, and their errors; None where fewer than two windows have one."""
+        set_placements(self.table, self.tracks.placements)  # where a run was broken off, a window may not have come here
+        try:
+            trajectory = self.tracks.trajectory()
+        except ValueError:
+            return None
+        keep = trajectory.time <= self.table[-1]["time_us"]
+        if int(keep.sum()) < 2:
+            return None
+        trajectory = Trajectory(trajectory.time[keep].cpu(), on_cpu(trajectory.pose[keep]))
         found = self.judge.final(trajectory, self.tracks.map.plane.normal)
         if found is not None:
             self.error, self.curves = found
@@ -210,6 +218,9 @@ class TrackReport:
             outputs["trajectory.txt"] = lambda: self._write("trajectory.txt", lambda name: write_trajectory(name, metric))
         if self.tracks.options.map is None:
             outputs["map.h5"] = lambda: save_map(self.folder / "map.h5", m)
+            for other in self.tracks.atlas[1:]:
+                name = f"map_{other.number}.h5"
+                outputs[name] = partial(save_map, self.folder / name, other)
         return outputs
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
@@ -247,6 +258,10 @@ class TrackReport:
             "events": self.events,
             "seconds": round(self.seconds, 6),
             "lost_seconds": round(lost, 6),
+            "losses": self.tracks.losses,
+            "recoveries": self.tracks.recoveries,
+            "maps": len(self.tracks.atlas),
+            "maps_joined": self.tracks.joins,
             "keyframes": 0 if m is None else len(m.keyframes),
             "plane": None if m is None else {"normal": m.plane.normal[0].tolist(), "distance": m.plane.distance[0].item()},
             "error": self.error,

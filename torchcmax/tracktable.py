@@ -16,10 +16,11 @@ from torchcmax.core.pose import Pose
 from torchcmax.core.state import State
 from torchcmax.folder import COLUMNS, WHOLE, cell
 from torchcmax.slam.map import Map
-from torchcmax.slam.system import Track
+from torchcmax.slam.system import Placement, Track
 
 POSE = "tx ty tz qx qy qz qw".split()
-TABLE = (*COLUMNS, "time_us", *POSE, "status", "overlap", "strength", "map", "keyframe")
+SIGNS = "overlap strength supported doubt weakest weakest_share".split()
+TABLE = (*COLUMNS, "time_us", *POSE, "status", "reason", *SIGNS, "map", "keyframe")
 KEYFRAMES = ("number", "time_us", *POSE, *(f"{name}_{axis}" for name in ("omega", "v") for axis in "xyz"), "events")
 ROUND = WHOLE | {"time_us", "map", "keyframe", "number"}
 Row = dict[str, Any]
@@ -27,7 +28,7 @@ Row = dict[str, Any]
 
 def row(track: Track) -> Row:
     """One line of windows.csv, in TABLE, with the pose as it is now but for its rotation; nan where there is no such number."""
-    window, state = track.window, track.state
+    window, state, signs = track.window, track.state, track.signs
     parts = state.motion.omega, state.motion.velocity, track.normal, state.pose.t
     numbers = torch.cat([part.detach().double() for part in parts], -1)[0].tolist()
     start = int(window.start[0])
@@ -36,7 +37,8 @@ def row(track: Track) -> Row:
         *(track.index, start, start + round(float(window.duration[0]) * 1e6), int((window.polarity != 0).sum())),
         *(track.contrast_zero, track.contrast, gain, *numbers[:9], track.evaluations, track.converged),
         *(track.time, *numbers[9:], math.nan, math.nan, math.nan, math.nan),
-        *(track.status, track.overlap, track.strength, track.map.number, track.keyframe),
+        *(track.status, track.reason, signs.overlap, signs.strength, signs.supported, signs.doubt, signs.weakest, signs.share),
+        *(track.map.number, track.keyframe),
     )
     return dict(zip(TABLE, values, strict=True))
 
@@ -45,6 +47,18 @@ def set_poses(lines: Sequence[Row], pose: Pose) -> None:
     """Poses [M] into as many lines."""
     for line, numbers in zip(lines, pose_row(pose).tolist(), strict=True):
         line.update(zip(POSE, numbers, strict=True))
+
+
+def set_placements(lines: Sequence[Row], placements: Sequence[Placement]) -> None:
+    """Where each window belongs in the end: nowhere, for a lost one, or in the world of its map."""
+    placed = [(line, p) for line, p in zip(lines, placements, strict=False) if p.site is not None]
+    for line, p in zip(lines, placements, strict=False):
+        line.update(dict.fromkeys((*POSE, "map"), math.nan), status=p.status, keyframe=p.keyframe)
+        if p.site is not None:
+            line.update(map=p.site.map.number)
+    if placed:
+        pose = State.join([p.there() for _, p in placed]).pose
+        set_poses([line for line, _ in placed], Pose(pose.R.cpu(), pose.t.cpu()))
 
 
 def pose_row(pose: Pose) -> Tensor:

@@ -13,7 +13,7 @@ from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.simulator import Simulation, pose, simulate, velocity
 from torchcmax.slam.map import Keyframe, Map, Texture
-from torchcmax.slam.system import BORDER, middle_of
+from torchcmax.slam.run import BORDER
 from torchcmax.slam.tracker import rays_of
 
 
@@ -35,7 +35,7 @@ def scene(options: Simulation, events: int) -> Scene:
     """All windows of so many events."""
     windows = list(simulate(options).windows(events))
     plane, first = first_camera(options, windows[0].start)
-    return Scene(options.camera, windows, [true_state(options, middle_of(w), first, plane) for w in windows], unit(plane))
+    return Scene(options.camera, windows, [true_state(options, w.middle, first, plane) for w in windows], unit(plane))
 
 
 def first_camera(options: Simulation, time: torch.Tensor) -> tuple[Plane, Pose]:
@@ -62,7 +62,7 @@ def map_of(camera: Camera, plane: Plane, texture: Texture | None = None) -> Map:
 
 
 def keyframe_of(window: Window, state: State) -> Keyframe:
-    return Keyframe(int(middle_of(window)), state, window.duration.double(), Ink.of(window, window.weight))
+    return Keyframe(int(window.middle), state, window.duration.double(), Ink.of(window, window.weight))
 
 
 def drawn(scene: Scene, which: range) -> Map:

@@ -11,7 +11,6 @@ from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.match import NUMBERS, Matching, units
 from torchcmax.core.pose import Motion
 from torchcmax.core.state import SIZE, State
-from torchcmax.slam.system import middle_of
 from torchcmax.slam.tracker import Belief, Sight, Tracking, basis_of, front, rays_of, speed, step
 
 CAMERA = Camera.pinhole((90, 120), 100 / 120)
@@ -122,7 +121,7 @@ def perturbed(scene, i, seed, size=2.0):
     window, true = scene.windows[i], scene.states[i]
     unit = size * units(true, scene.plane, window.duration.double(), scene.focal)[:, :SIZE]
     off = torch.randn(1, SIZE, generator=random, dtype=torch.float64) * unit
-    return Belief(middle_of(window), true.moved(off), torch.diag_embed(unit.square()))
+    return Belief(window.middle, true.moved(off), torch.diag_embed(unit.square()))
 
 
 def others(scene, i):

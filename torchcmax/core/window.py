@@ -37,6 +37,11 @@ class Window:
         """Time within the window, 0 at its first event and 1 at its last: [B, N]."""
         return self.dt / torch.where(self.duration > 0, self.duration, 1.0)[:, None]
 
+    @property
+    def middle(self) -> Tensor:
+        """Its time, half way from the first to the last event: [B] int64 µs."""
+        return self.start + (self.duration.double() * 5e5).round().long()
+
     def __getitem__(self, index: Tensor | slice) -> Window:
         return Window(*(getattr(self, f.name)[index] for f in fields(self)))
 

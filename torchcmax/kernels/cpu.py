@@ -314,7 +314,7 @@ def match(q: Tensor, task: Any, how: Any, ridge: float, closest: float, terms: i
     places, found = _places(task, closest), [None] * len(q)
 
     def work(row: int) -> None:
-        both = texture[row], ground[row]
+        both = texture[row % len(texture)], ground[row % len(texture)]
         chance = ghosts(row) if task.ghosts is not None else rows(row, slice(0))
         numbers = places(row), prior[row], rows(row), chance, some(row), lens, both, limits, weight, terms, ridge
         found[row] = matching.match(start[row], basis, *numbers)
@@ -332,7 +332,7 @@ def _places(task: Any, closest: float) -> Callable[[int], placing.Place]:
     seconds, focal = _array(task.seconds.double()), float(chart.focal)
 
     def place(i: int) -> placing.Place:
-        known = normal[i], across[i], float(distance[i]), closest, view[i], corner[i]
+        known = normal[i], across[i], float(distance[i]), closest, view[i % len(view)], corner[i % len(view)]
         return placing.Place(R[i], t[i], omega[i], velocity[i], *known, float(seconds[i]), focal)
 
     return place

@@ -102,6 +102,17 @@ def speed(state: State, plane: Plane, ray: Tensor, focal: float) -> float:
     return focal * float(image.square().sum(-1).mean().sqrt())
 
 
+def doubt(belief: Belief, plane: Plane, ray: Tensor, focal: float) -> float:
+    """How far the image may be off where a camera [1] is believed to be: px, rms over rays [M, 3], one sigma."""
+    there = belief.state.seen(plane)
+    unit = torch.eye(3).to(ray)
+    turned = torch.linalg.cross(unit[:, None], ray[None], dim=-1)  # [3, M, 3]
+    shifted = unit[:, None] * (-(ray @ there.normal[0]) / there.distance)[None, :, None]
+    moved = torch.cat([turned, shifted])
+    image = (moved[..., :2] - ray[:, :2] * moved[..., 2:]).flatten(1).T  # [2 M, 6]
+    return focal * float(((image @ belief.covariance[0, :6, :6]) * image).sum().div(len(ray)).sqrt())
+
+
 @dataclass(frozen=True)
 class Front:
     """What windows show by themselves: motion [B] at their middles | contrast at rest and with it [B] | evaluations, converged [B]"""
@@ -155,12 +166,17 @@ class Sight:
 
 @dataclass(frozen=True)
 class Step:
-    """What windows gave: belief before and after them, what they show alone, where they match."""
+    """What windows gave: belief before and after them, what they show alone, where they match.
+
+    information, prior [B, 12, 12]: about a step in px, of the events and of what was predicted
+    """
 
     before: Belief
     after: Belief
     front: Front
     match: Match
+    information: Tensor
+    prior: Tensor
 
 
 def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight], how: Tracking, name: ModelName = "planar") -> Step:
@@ -183,7 +199,8 @@ def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight]
     covariance = torch.linalg.inv(torch.linalg.inv(before.covariance) + information)
     if how.matching.objective == "variance":  # it does not say how sure it is; nobody asks
         covariance = torch.eye(SIZE).to(covariance).expand_as(covariance)
-    return Step(before, Belief(before.time, found.state, (covariance + covariance.mT) / 2), alone, found)
+    after = Belief(before.time, found.state, (covariance + covariance.mT) / 2)
+    return Step(before, after, alone, found, found.information[:, :SIZE, :SIZE], tasks[0].prior[:, :SIZE, :SIZE])
 
 
 def basis_of(name: ModelName, refine: str) -> Tensor:

@@ -1,0 +1,34 @@
+"""All that can be set about following a camera before a plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchcmax.core.objective import Look
+from torchcmax.slam.map import Texture
+from torchcmax.slam.mapper import Mapping
+from torchcmax.slam.relocalize import Relocalizing
+from torchcmax.slam.sense import Sensing
+from torchcmax.slam.tracker import ModelName, Tracking
+
+
+@dataclass(frozen=True)
+class Slam:
+    """How a camera is tracked before a plane, and the plane mapped."""
+
+    model: ModelName = "planar"
+    """planar: six degrees of freedom; translation or rotation: what the camera is known to do."""
+    start: Look = field(default_factory=lambda: Look(contrast="gradient_magnitude"))
+    """How windows are looked at before there is a map."""
+    tracking: Tracking = field(default_factory=Tracking)
+    """How windows are tracked."""
+    sensing: Sensing = field(default_factory=Sensing)
+    """When a window is still, weak or lost."""
+    mapping: Mapping = field(default_factory=Mapping)
+    """How the map is made."""
+    texture: Texture = field(default_factory=Texture)
+    """How votes become the strength of edges."""
+    relocalizing: Relocalizing = field(default_factory=Relocalizing)
+    """How a camera is searched for in a map."""
+    atlas: bool = True
+    """A lost camera begins a new map, which is joined with the old one when it is found there."""

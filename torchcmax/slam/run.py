@@ -1,0 +1,468 @@
+"""One recording on its way: start, tracking, loss, new local maps, and their joining; the only file that knows the order of things."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchcmax.core.camera import Camera, Canvas
+from torchcmax.core.draw import Ink
+from torchcmax.core.estimate import Search
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Motion, Pose, Trajectory
+from torchcmax.core.state import State
+from torchcmax.core.window import Window
+from torchcmax.slam.atlas import Similarity, fitting
+from torchcmax.slam.map import Keyframe, Map
+from torchcmax.slam.mapper import first_plane, rebased, settled
+from torchcmax.slam.options import Slam
+from torchcmax.slam.record import ALONG, FEW, GAP, NOISE, UNSURE, Placement, Signs, Site, Status, Track
+from torchcmax.slam.relocalize import Glimpse, Grid, search_near
+from torchcmax.slam.seek import Searching, Seeker, before_plane, covariance_of
+from torchcmax.slam.sense import beyond_chance, decided, name_of, support
+from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, doubt, front, rays_of, speed
+
+FIRST_SIGMA = 0.005, 0.005, 0.2, 0.2  # of the last start window: turn, shift, angular velocity, velocity
+FOUND_SIGMA = 0.01, 0.01, 0.3, 0.3  # of a camera that was found near
+REST = 0.05  # rad/s and distances/s that a still camera may move, one sigma
+BORDER = 4  # px from one ray of the sensor's edge to the next
+LEAST = 0.5  # share of the first windows that are enough where the camera comes to rest
+ROUNDS = 2  # of joint optimization where two maps are joined
+
+
+class Source(Protocol):
+    """Consecutive windows of a recording, whose size the caller decides: as io.Stream."""
+
+    def look(self, events: int, seconds: float) -> Window | None:
+        """The next window, without going past it; None at the end."""
+
+    def skip(self, events: int) -> None:
+        """Goes past the first events of what was last looked at."""
+
+
+class TooShort(ValueError):
+    """A recording that ends before there is anything to begin with."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A window with what is known of it before it is tracked: whether it is noise, or comes after a gap."""
+
+    window: Window
+    supported: float
+    noise: bool
+    gap: bool
+
+    @property
+    def time(self) -> int:
+        """µs of its middle."""
+        return int(self.window.middle[0])
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """A window that waits for a plane, with what it shows alone; the number of its placement."""
+
+    window: Window
+    front: Front
+    number: int
+
+
+class Run:
+    """A camera on its way."""
+
+    source: Source
+
+    def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam, given: Map | None) -> None:
+        self.number, self.canvas, self.options, self.given = number, canvas, options, given
+        self.sensor = Canvas.around(camera, 0.0)
+        rays = camera.rays()
+        edge = torch.cat([rays[0], rays[-1], rays[:, 0], rays[:, -1]])[::BORDER]
+        self.border, self.rays = edge.float(), rays_of(camera)
+        self.sites: list[Site] = [] if given is None else [self._site(given)]
+        self.site: Site | None = None  # where the camera is; None while it is lost
+        self.belief: Belief | None = None
+        self.placements: list[Placement] = []
+        self.gathered: list[Gathered] = []
+        self.early: list[tuple[Seen, Front | None]] = []  # windows before there is anything to tell of them
+        self.motion: Motion | None = None  # before a wall, while there is no map
+        self.seeker: Seeker | None = None
+        self.grid: tuple[Map, int, Grid] | None = None
+        self.weak_since: int | None = None
+        self.ended: int | None = None  # µs of the last window's end
+        self.index = self.losses = self.recoveries = self.joins = 0
+
+    # windows
+
+    def next(self) -> Seen | None:
+        """The next window: as long as the image takes to move by the displacement wanted."""
+        how = self.options.tracking
+        if self.site is not None:
+            return self._seen(self._take(self._belief.state, self.site.map.plane))
+        if self.motion is None:
+            first = self.source.look(how.most, how.seconds)
+            if first is None:
+                return None
+            if self._support(first)[1]:
+                self.source.skip(first.ray.shape[1])
+                return self._seen(first)
+            self.motion = self._front(first).motion
+        return self._seen(self._take(replace(still(rest()), motion=self.motion), WALL))
+
+    def _take(self, state: State, plane: Plane) -> Window | None:
+        how = self.options.tracking
+        seconds = min(how.seconds, how.displacement / max(speed(state, plane, self.rays, self.canvas.focal), 1e-6))
+        found = self.source.look(how.most, seconds)
+        if found is not None and found.ray.shape[1] < how.fewest and seconds < how.seconds:
+            found = self.source.look(how.fewest, how.seconds)
+        if found is not None:
+            self.source.skip(found.ray.shape[1])
+        return found
+
+    def _seen(self, window: Window | None) -> Seen | None:
+        if window is None:
+            return None
+        start, before = int(window.start[0]), self.ended
+        self.ended = start + round(float(window.duration[0]) * 1e6)
+        late = before is not None and (start - before) * 1e-6 > self.options.sensing.patience
+        return Seen(window, *self._support(window), late)
+
+    def _support(self, window: Window) -> tuple[float, bool]:
+        """How supported the events of a window are, beyond chance, and whether it is noise."""
+        how = self.options.sensing
+        supported, chance = support(window, self.sensor, how.slice)
+        beyond = beyond_chance(supported, chance)
+        return beyond, how.still and chance < how.dense and beyond < how.noise
+
+    def _front(self, window: Window) -> Front:
+        """What a window shows alone, before a wall, from the last motion on."""
+        blur = (4.0, 2.0, 1.0) if self.motion is None else (2.0, 1.0)
+        search = Search(blur, margin=self.options.tracking.search.margin)
+        state = still(rest()) if self.motion is None else replace(still(rest()), motion=self.motion)
+        return front(
+            window, self.canvas, state, WALL, replace(self.options.tracking, look=self.options.start, search=search), self.options.model
+        )
+
+    # before a map, and lost
+
+    def wander(self, seen: Seen, reason: str = "") -> Iterator[Track]:
+        """A window while there is no map to track it on: gathered for a new one, and searched for in the old one."""
+        window = seen.window
+        alone = None if seen.noise else self._front(window)
+        self.placements.append(Placement(seen.time, "lost" if self.sites else "still"))
+        number, early = len(self.placements) - 1, self.index == 0
+        if early:
+            self.early.append((seen, alone))
+        else:
+            yield self._lost(seen, alone, reason)
+        if alone is None:  # at rest: what was gathered is enough for a map, or forgotten
+            if len(self.gathered) >= max(2, LEAST * self.options.mapping.first):
+                yield from self._begin()
+            self.gathered, self.motion = [], None
+            return
+        self.motion = alone.motion
+        if self.options.atlas or not self.sites:
+            self.gathered.append(Gathered(window, alone, number))
+        full = max(len(self.gathered), len(self.early)) >= self.options.mapping.first
+        if self._seek(window, alone.motion, WALL.normal) or (early and self.given is not None and full):
+            yield from self._early_tracks()  # it is on the given map, or not near where that was drawn from
+        elif len(self.gathered) >= self.options.mapping.first:
+            yield from self._begin()
+
+    def _begin(self) -> Iterator[Track]:
+        """The gathered windows make a first plane and map."""
+        how, model = self.options.mapping, self.options.model
+        gathered, self.gathered = self.gathered, []
+        windows, motions = [g.window for g in gathered], [g.front.motion for g in gathered]
+        free = (model != "translation", model != "rotation")
+        solved = rebased(first_plane(windows, motions, self.canvas.focal, how, free=free).frames)
+        number = 1 + max((site.map.number for site in self.sites), default=-1)
+        m = Map(solved.plane, self.canvas.focal, self.border, self.options.texture, number=number)
+        m.draw([keyframe_of(window, solved.state[i : i + 1]) for i, window in enumerate(windows)])
+        self.site = self._site(m)
+        self.sites.append(self.site)
+        for _ in range(how.settle):
+            self._settle(self.site, None)
+        keyframes = self.site.map.keyframes
+        for i, g in enumerate(gathered):
+            self.placements[g.number].hang(self.site, i, keyframes[i].state, "start")
+        first = still(keyframes[0].state.later(-keyframes[0].seconds / 2).pose)
+        for placement in self.placements:  # at rest until it began to move
+            if placement.site is None and placement.status == "still":
+                placement.hang(self.site, 0, first, "still")
+        self.belief = Belief(torch.tensor([keyframes[-1].time]), keyframes[-1].state, covariance_of(FIRST_SIGMA))
+        self.weak_since = None
+        yield from self._early_tracks()
+
+    def _early_tracks(self) -> Iterator[Track]:
+        """What was kept back is told."""
+        early, self.early = self.early, []
+        for (seen, alone), placement in zip(early, self.placements, strict=False):
+            if placement.site is None:
+                yield self._lost(seen, alone, NOISE if seen.noise else "")
+            else:
+                reason = NOISE if placement.status == "still" else ""
+                yield self._track(seen, placement, Signs(seen.supported, 1.0), reason, alone, drawn=placement.status == "start")
+
+    def _lost(self, seen: Seen, alone: Front | None, reason: str) -> Track:
+        """A window of a camera of which nothing is known: it stays where it was."""
+        state = still(rest() if self.belief is None else self.belief.state.pose)
+        site = self.sites[-1] if self.sites else self._site(Map(WALL, self.canvas.focal, self.border, self.options.texture))
+        return self._track(seen, Placement(seen.time, "lost", site), Signs(seen.supported, 0.0, 0.0), reason, alone, state=state)
+
+    def lose(self) -> None:
+        """From now on nothing is believed of where the camera is, nor of the windows in which it met few edges before."""
+        for placement in self.placements[::-1]:
+            if self.weak_since is None or placement.time < self.weak_since:
+                break
+            placement.lose()
+        self.site, self.weak_since, self.gathered, self.motion = None, None, [], None
+        self.losses += 1
+
+    def _seek(self, window: Window, motion: Motion, normal: Tensor) -> bool:
+        """Looks for the camera in the first map, while it is not there; whether it was found."""
+        if not self.sites or self.site is self.sites[0] or not self.options.relocalizing.far:
+            return False
+        if self.seeker is None:
+            how = self.options
+            searching = Searching(how.relocalizing, how.tracking, how.model, how.sensing.certain)
+            self.seeker = Seeker(self.sites[0].map, self.canvas, self.sensor, self.rays, searching)
+            if self.given is not None and self.index == 0:
+                self.seeker.guess(window, motion, normal)
+        path = self.seeker.offer(window, motion, normal)
+        if path is None:
+            return False
+        self.seeker.close()
+        self.seeker = None
+        self._arrive(self.sites[0], path)
+        return True
+
+    def _arrive(self, home: Site, path: list[Belief]) -> None:
+        """The camera was found: what it drew meanwhile is joined, and it goes on in the first map."""
+        if self.site is not None:
+            self._join(home, self.site, path[-1])
+        else:
+            there = {int(belief.time[0]): belief for belief in path}
+            for placement in self.placements[::-1]:
+                if placement.time < min(there):
+                    break
+                if placement.site is None and placement.time in there:
+                    state = there[placement.time].state
+                    placement.hang(home, nearest(home.map, state.pose), state, "ok")
+            self.belief = path[-1]
+        self.site, self.weak_since, self.gathered, self.motion = home, None, [], None
+        self.recoveries += 1
+
+    def _join(self, home: Site, local: Site, now: Belief) -> None:
+        """Two maps become one, where what the second one drew fits the first; a given map stays as it is, and is only told where."""
+        similarity = Similarity.between(self._belief.state, local.map.plane, now.state, home.map.plane)
+        self.belief = now
+        there = [(p, similarity.state(p.there())) for p in self.placements if p.site is local]
+        keyframes = fitting(local.map, similarity, self._grid(home), self.sensor)
+        if keyframes is None:
+            return
+        if self.given is None:
+            home.map.draw(keyframes)
+        for placement, state in there:
+            placement.hang(home, nearest(home.map, state.pose), state, placement.status)
+        for _ in range(ROUNDS if self.given is None else 0):
+            self._settle(home, len(keyframes), moving=True)
+        self.sites.remove(local)
+        self.joins += 1
+
+    # on a map
+
+    @property
+    def _belief(self) -> Belief:
+        """What is believed, where there is a map."""
+        if self.belief is None:
+            raise ValueError("nothing is known of the camera before the first plane is found")
+        return self.belief
+
+    def predicted(self, window: Window) -> Belief:
+        """What is known of the camera at the window's middle before it is looked at."""
+        return self._belief.at(window.middle, self.options.tracking.acceleration)
+
+    def sight(self, site: Site, window: Window, belief: Belief) -> Sight | None:
+        """What the camera sees of a map from where it is believed to be; None where it looks along the plane."""
+        return Sight.of(site.map, belief.state, window.duration.double())
+
+    def hold(self, site: Site, seen: Seen) -> Track:
+        """A window of noise: the camera stays where it was."""
+        state, covariance = still(self._belief.state.pose), self._belief.covariance.clone()
+        covariance[:, 6:] = covariance[:, :, 6:] = 0
+        covariance[:, range(6, 12), range(6, 12)] = REST**2
+        self.belief = Belief(seen.window.middle, state, covariance)
+        return self._track(seen, self._placed(site, seen, "still"), Signs(seen.supported), NOISE)
+
+    def blind(self, seen: Seen, reason: str = ALONG) -> Iterator[Track]:
+        """A window of a camera that is lost from now on."""
+        self.lose()
+        yield from self.wander(seen, reason)
+
+    def follow(self, site: Site, seen: Seen, found: Step, row: int) -> Iterator[Track]:
+        """A window that was tracked: its status, and what it does to the map."""
+        self.belief, strength = found.after[row : row + 1], float(found.match.strength[row])
+        tells = self.options.tracking.matching.objective == "lookup"  # how sure it is
+        unsure = doubt(self.belief, site.map.plane, self.rays, self.canvas.focal) if tells else float("nan")
+        status, reason = self._status(site, strength, unsure, seen.time)
+        if reason == FEW:  # keep to what was predicted, or to where it is found near, which is believed when the next window fits there
+            self.belief = self._near(site, seen.window, found, row) or found.before[row : row + 1]
+        sight = self.sight(site, seen.window, self.belief)
+        if sight is None or status == "lost":
+            yield from self.blind(seen, ALONG if sight is None else reason)
+            return
+        overlap = site.map.overlap(sight.H_k, self.rays, sight.area)
+        drawn = status == "ok" and overlap < self.options.mapping.overlap and self.given is None
+        if drawn:
+            site.map.draw([keyframe_of(seen.window, self._belief.state)])
+            self._optimize(site)
+        share, directions = decided(found.information[row], found.prior[row])
+        signs = Signs(seen.supported, overlap, strength, unsure, name_of(directions[:, 0]), float(share[0]))
+        evaluations = int(found.match.evaluations[row])
+        yield self._track(seen, self._placed(site, seen, status), signs, reason, found.front, row, evaluations, drawn)
+        if status == "ok":
+            motion, there = before_plane(self._belief.state, site.map.plane)
+            self._seek(seen.window, motion, there.normal)
+
+    def _status(self, site: Site, strength: float, unsure: float, time: int) -> tuple[Status, str]:
+        """Of a window that was tracked, and why it is not ok."""
+        how = self.options.sensing
+        if not site.usual or strength > how.weak * median(site.usual):
+            site.usual.append(strength)
+            self.weak_since = None
+            return ("lost", UNSURE) if unsure >= how.hopeless else ("weak", UNSURE) if unsure >= how.certain else ("ok", "")
+        self.weak_since = time if self.weak_since is None else self.weak_since
+        return "lost" if (time - self.weak_since) * 1e-6 > how.patience else "weak", FEW
+
+    def _near(self, site: Site, window: Window, found: Step, row: int) -> Belief | None:
+        """A camera that met too little is looked for around where it was expected."""
+        how, before = self.options.relocalizing, found.before[row : row + 1]
+        if not how.near:
+            return None
+        shown = State(before.state.pose, Motion(found.front.motion.omega[row : row + 1], found.front.motion.velocity[row : row + 1]))
+        motion, there = before_plane(shown, site.map.plane)
+        places = search_near(Glimpse.of(window, motion, there.normal, self.sensor, self.border), self._grid(site), before.state)
+        sure = float(places.score[0]) >= how.accept and places.clear >= how.ratio
+        return Belief(before.time, places.state[:1], covariance_of(FOUND_SIGMA)) if sure else None
+
+    def _grid(self, site: Site) -> Grid:
+        """The map made ready for searching, kept until it changes."""
+        kept = self.grid
+        if kept is None or kept[0] is not site.map or kept[1] != len(site.map.keyframes):
+            self.grid = kept = site.map, len(site.map.keyframes), Grid(site.map, self.options.relocalizing)
+        return kept[2]
+
+    def _optimize(self, site: Site) -> None:
+        """A joint optimization after every few new keyframes, while the map is young."""
+        how = self.options.mapping
+        site.fresh, site.new = site.fresh + 1, site.new + 1
+        if site.fresh >= how.every and site.new <= how.until:
+            site.fresh = 0
+            self._settle(site, how.last, moving=True)
+
+    def _settle(self, site: Site, last: int | None, moving: bool = False) -> None:
+        """One round; a camera that is moving there goes with the newest keyframe."""
+        before = site.map.keyframes[-1].state.pose
+        basis = basis_of(self.options.model, "full")
+        site.map = settled(site.map, site.start, self.options.mapping, self.options.tracking.matching, last, basis).map
+        if moving:
+            pose = site.map.keyframes[-1].state.pose @ before.inverse() @ self._belief.state.pose
+            self.belief = replace(self._belief, state=replace(self._belief.state, pose=pose))
+
+    # the end
+
+    def finish(self) -> Iterator[Track]:
+        """A map of what there is, where there is none, then all keyframes once more."""
+        if not self.sites:
+            if len(self.gathered) < min(2, self.options.mapping.first):
+                few = f"{len(self.gathered)} windows that show motion, at least 2 are wanted"
+                raise TooShort(f"recording {self.number} holds too few events to begin: {few}")
+            yield from self._begin()
+        yield from self._early_tracks()
+        if self.seeker is not None:
+            self.seeker.close()
+            self.seeker = None
+        if self.given is None:
+            counts = {id(site): sum(p.site is site for p in self.placements) for site in self.sites}
+            self.sites.sort(key=lambda site: -counts[id(site)])  # the first one, if others are as large
+            for site in self.sites:
+                for _ in range(self.options.mapping.final):
+                    self._settle(site, None)
+
+    @property
+    def map(self) -> Map:
+        """The main one: the first, and at the end the one that most windows belong to."""
+        if not self.sites:
+            raise ValueError("there is no map before the first plane is found")
+        return self.sites[0].map
+
+    def trajectory(self) -> Trajectory:
+        """Poses at the middles of the windows that belong to the main map, as the keyframes that they hang on are now."""
+        here = [p for p in self.placements if self.sites and p.site is self.sites[0]]
+        if len(here) < 2:
+            raise ValueError(f"a trajectory wants at least two windows on the map, got {len(here)}")
+        return Trajectory(torch.tensor([p.time for p in here]), State.join([p.there() for p in here]).pose)
+
+    # telling
+
+    def _site(self, m: Map) -> Site:
+        return Site(m, m.plane, deque(maxlen=self.options.sensing.recent))
+
+    def _placed(self, site: Site, seen: Seen, status: Status) -> Placement:
+        placement = Placement(seen.time, status)
+        placement.hang(site, nearest(site.map, self._belief.state.pose), self._belief.state, status)
+        self.placements.append(placement)
+        return placement
+
+    def _track(
+        self, seen: Seen, placement: Placement, signs: Signs, reason: str = "", alone: Front | None = None, row: int = 0,
+        evaluations: int = 0, drawn: bool = False, state: State | None = None,
+    ) -> Track:  # fmt: skip
+        """What is told of a window; state: of a lost one."""
+        assert placement.site is not None
+        m, state = placement.site.map, state or placement.there()
+        zero = contrast = float("nan")
+        converged = False
+        if alone is not None:
+            zero, contrast, converged = float(alone.zero[row]), float(alone.contrast[row]), bool(alone.converged[row])
+            evaluations += int(alone.evaluations[row])
+        normal = m.plane.seen_from(state.pose).normal
+        track = Track(
+            self.number, self.index, seen.window, seen.time, state, normal, zero, contrast, signs, placement.status,
+            GAP if seen.gap and placement.status == "lost" else reason, evaluations, converged, placement.keyframe, drawn, m,
+        )  # fmt: skip
+        self.index += 1
+        return track
+
+
+WALL = Plane(torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64), torch.ones(1, dtype=torch.float64))
+
+
+def rest() -> Pose:
+    """Where the world begins: [1]."""
+    return Pose(torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
+
+
+def still(pose: Pose) -> State:
+    """A camera [1] that does not move."""
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    return State(pose, Motion(zero, zero))
+
+
+def nearest(m: Map, pose: Pose) -> int:
+    """The keyframe whose camera is nearest to one [1], in plane distances and radians."""
+    state = State.join([keyframe.state for keyframe in m.keyframes])
+    away, turned = (state.pose.t - pose.t).norm(dim=-1) / m.plane.distance, (state.pose.R - pose.R).flatten(1).norm(dim=-1) / 2**0.5
+    return int((away + turned).argmin())
+
+
+def keyframe_of(window: Window, state: State) -> Keyframe:
+    """A window [1] with the state of its middle, to be drawn."""
+    return Keyframe(int(window.middle[0]), state, window.duration.double(), Ink.of(window, window.weight))

@@ -1,0 +1,192 @@
+"""The search of a lost camera in a map that it knows: it goes on beside the tracking, and believes nothing before the camera has moved."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcmax.core.camera import Canvas
+from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Motion, Pose
+from torchcmax.core.state import State
+from torchcmax.core.window import Window
+from torchcmax.slam.map import Map
+from torchcmax.slam.relocalize import Found, Glimpse, Grid, Relocalizing, found_at, judged, search_far, search_near
+from torchcmax.slam.tracker import Belief, ModelName, Sight, Tracking, doubt, speed, step
+
+LIKELY = 0.6  # share of `accept` that a place must score to be followed
+MOST = 4  # places that are followed at a time
+SIGMA = 0.02, 0.01, 0.5, 0.5  # of a place that was found: turn rad, shift, angular velocity rad/s, velocity distances/s
+SAME = 8.0  # px that places are apart at least
+BETTER = 1.02  # times the score that a place nearby must have to be taken instead
+FORGET = 0.3  # share of `accept` below which a place is given up at once
+
+
+@dataclass
+class Candidate:
+    """A place that is followed: what is believed of a camera there, window by window, its scores, and px of motion since it was found."""
+
+    path: list[Belief]
+    scores: list[float]
+    moved: float = 0.0
+
+    @property
+    def belief(self) -> Belief:
+        """Now."""
+        return self.path[-1]
+
+    @property
+    def score(self) -> float:
+        """The mean, in which the last windows count more."""
+        recent = self.scores[-5:]
+        return sum(recent) / len(recent)
+
+
+class Searching(NamedTuple):
+    """The options of a seeker; certain: px that the image may be off where a camera is found, one sigma."""
+
+    how: Relocalizing
+    tracking: Tracking
+    model: ModelName
+    certain: float
+
+
+class Seeker:
+    """Looks for a camera in one map.  A search goes on in a thread of its own beside the tracking."""
+
+    def __init__(self, m: Map, canvas: Canvas, sensor: Canvas, rays: Tensor, options: Searching) -> None:
+        """canvas: of the search for motion | sensor: one as large as that | rays [M, 3]: a grid over it"""
+        self.map, self.canvas, self.sensor, self.rays = m, canvas, sensor, rays
+        self.how, self.tracking, self.model, self.certain = options
+        how = options.how
+        self.grid = Grid(m, how)
+        self.candidates: list[Candidate] = []
+        self.guessed = False
+        self.pool = ThreadPoolExecutor(1, "torchcmax-seek")
+        self.flight: Future[Found] | None = None
+        self.began = self.next = 0  # µs
+        self.pause = how.wait
+        self.since: list[Window] = []
+        self.searches = 0
+
+    def guess(self, window: Window, motion: Motion, normal: Tensor) -> None:
+        """Begins with the places of the keyframes, where a window fits there; `offer` of the same window comes next."""
+        poses = [k.state.pose for k in self.map.keyframes]
+        glimpse = Glimpse.of(window, motion, normal, self.sensor, self.map.border)
+        every = Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses]))
+        self.candidates = self._kept(found_at(glimpse, self.grid, every, self.how.rounds), window)
+        self.guessed = bool(self.candidates)
+
+    def offer(self, window: Window, motion: Motion, normal: Tensor) -> list[Belief] | None:
+        """The next window [1], with what it shows alone before a plane with this normal.
+
+        -> where the camera was in the last windows, this one at the end, once that is sure
+        """
+        start = int(window.start[0])
+        self.candidates = self._merged(self._followed(self.candidates, window, first=self.guessed))
+        self.guessed = False
+        if self.flight is not None:
+            self.since.append(window)
+            if start - self.began >= self.how.wait * 1e6 and (self.how.steady or self.flight.done()):
+                self._land()
+        likely = bool(self.candidates) and self.candidates[0].score >= self.how.accept
+        if self.flight is None and self.how.far and start >= self.next and not likely:
+            glimpse = Glimpse.of(window, motion, normal, self.sensor, self.map.border)
+            self.flight, self.began, self.since = self.pool.submit(search_far, glimpse, self.grid), start, [window]
+            self.searches += 1
+        best = self._sure()
+        return None if best is None else self._polished(best, window)
+
+    def _land(self) -> None:
+        """What a search found, followed through the windows that came meanwhile, beside what is followed already."""
+        assert self.flight is not None
+        fresh = self._kept(self.flight.result(), self.since[0])
+        for i, window in enumerate(self.since):
+            fresh = self._followed(fresh, window, first=i == 0)
+        self.flight, self.since = None, []
+        self.pause = self.how.wait if fresh else min(2 * self.pause, self.how.again)
+        self.next = self.began + round(self.pause * 1e6)
+        self.candidates = self._merged(self.candidates + fresh)
+
+    def _kept(self, found: Found, window: Window) -> list[Candidate]:
+        """The best places, as candidates."""
+        time, likely = window.middle, LIKELY * self.how.accept
+        scores = [score for score in found.score.tolist()[:MOST] if score >= likely]
+        return [Candidate([Belief(time, found.state[i : i + 1], covariance_of(SIGMA))], [score]) for i, score in enumerate(scores)]
+
+    def _followed(self, candidates: list[Candidate], window: Window, first: bool = False) -> list[Candidate]:
+        """Each place, one window on, without those that fit no more; first: it is the window that they were found by."""
+        alive: list[Candidate] = []
+        for one in candidates:
+            before = one.belief if first else one.belief.at(window.middle, self.tracking.acceleration)
+            sight = Sight.of(self.map, before.state, window.duration.double())
+            if sight is None:
+                continue
+            found = step(window, self.canvas, before, [sight], self.tracking, self.model)
+            score = self.judge(window, found.after.state)
+            moved = speed(found.after.state, self.map.plane, self.rays, self.canvas.focal) * float(window.duration[0])
+            path = [found.after] if first else [*one.path, found.after]
+            after = Candidate(path, [*one.scores, score], one.moved + moved)
+            if score >= FORGET * self.how.accept and after.score >= LIKELY * self.how.accept:
+                alive.append(after)
+        return alive
+
+    def _merged(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Best first, and of those that fell together the best."""
+        kept: list[Candidate] = []
+        for one in sorted(candidates, key=lambda one: -one.score):
+            if len(kept) < MOST and all(self.apart(one.belief.state, other.belief.state) > SAME for other in kept):
+                kept.append(one)
+        return kept
+
+    def judge(self, window: Window, state: State) -> float:
+        """The score of a window [1] at a state [1]."""
+        motion, there = before_plane(state, self.grid.plane)
+        return float(judged(Glimpse.of(window, motion, there.normal, self.sensor, self.grid.border), self.grid, state)[0][0])
+
+    def apart(self, one: State, other: State) -> float:
+        """px, rms, between what two cameras [1] see."""
+        there = [self.rays @ s.placement(self.map.plane, self.map.view)[0].mT for s in (one, other)]
+        xy = [ray[:, :2] / ray[:, 2:] * self.map.focal for ray in there]
+        return float((xy[0] - xy[1]).square().sum(-1).mean().sqrt())
+
+    def _sure(self) -> Candidate | None:
+        """The best place, where the camera has moved and it still fits well, and better than any other."""
+        if not self.candidates:
+            return None
+        best, *others = self.candidates
+        px, windows = self.how.confirm
+        enough = best.moved >= px and len(best.scores) > windows and best.score >= self.how.accept
+        clear = all(best.score >= self.how.ratio * other.score for other in others)
+        return best if enough and clear and self.doubt(best) < self.certain else None
+
+    def doubt(self, one: Candidate) -> float:
+        """px that the image may be off at a place, one sigma."""
+        return doubt(one.belief, self.map.plane, self.rays, self.canvas.focal)
+
+    def _polished(self, best: Candidate, window: Window) -> list[Belief]:
+        """The way of the best place; where there is a better one around it, that alone."""
+        motion, there = before_plane(best.belief.state, self.grid.plane)
+        near = search_near(Glimpse.of(window, motion, there.normal, self.sensor, self.grid.border), self.grid, best.belief.state)
+        if float(near.score[0]) < BETTER * best.scores[-1]:
+            return best.path
+        return [Belief(best.belief.time, near.state[:1], covariance_of(SIGMA))]
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self.pool.shutdown(wait=False, cancel_futures=True)
+
+
+def before_plane(state: State, plane: Plane) -> tuple[Motion, Plane]:
+    """The motion of a camera [1] in its own distances from a plane, and how it sees that."""
+    there = state.seen(plane)
+    return Motion(state.motion.omega, state.motion.velocity / there.distance[:, None]), there
+
+
+def covariance_of(sigma: tuple[float, float, float, float]) -> Tensor:
+    """[1, 12, 12], of turn, shift, angular velocity and velocity, one sigma."""
+    return torch.tensor(sigma, dtype=torch.float64).repeat_interleave(3).square().diag()[None]
