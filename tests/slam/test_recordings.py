@@ -1,5 +1,7 @@
 """Whole recordings with the default options: the bars that the project set itself."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -9,7 +11,8 @@ from torchcmax.core.draw import Ink, draw_sum
 from torchcmax.core.warp import TERMS, still
 from torchcmax.io.opening import OpenOptions, open
 from torchcmax.score import score
-from torchcmax.track import track
+from torchcmax.slam.tiles import spread
+from torchcmax.track import TrackOptions, track
 
 BARS = {  # % of the plane's distance, degrees, coverage
     "poster_6dof_sim": (0.4, 0.4, 0.99),
@@ -50,3 +53,73 @@ def test_real_planes_are_tracked_to_the_end_and_their_map_is_sharp(shared, name)
     ink = Ink.join([k.ink for k in m.keyframes])
     plain = draw_sum(still(torch.empty(len(ink.x), TERMS, 3, 3)), ink, Canvas.around(recording.camera))[0]
     assert sharpness(m.assembled(m.whole()).votes, ink.weight) >= 2 * sharpness(plain, ink.weight)
+
+
+def parts(tracks, recording, *stretches):
+    """Errors of stretches, s, each aligned alone."""
+    return [score(tracks.trajectory(), recording.truth, recording.plane, *(round(t * 1e6) for t in part)) for part in stretches]
+
+
+@pytest.fixture(scope="module")
+def lost(shared):
+    """The recording whose scene leaves the view from 4.02 to 4.48 s: whole, and up to 3.9 s."""
+    recording = open(shared / "data/sim/shapes_lost_sim")
+    runs = [track(recording, TrackOptions(end=end)) for end in (None, 3.9)]
+    for tracks in runs:
+        list(tracks)
+    return recording, *runs
+
+
+@pytest.mark.slow
+def test_a_camera_whose_scene_left_the_view_is_found_again_and_goes_on_as_well_as_before(lost):
+    recording, whole, _ = lost
+    before, after = parts(whole, recording, (0, 3.9), (5, 8))
+    assert after.position_rmse_m < 1.3 * before.position_rmse_m
+    assert after.orientation_rmse_deg < 1.3 * before.orientation_rmse_deg
+    assert after.coverage == 1
+    back = [p for p in whole.placements if p.time > 4_480_000 and p.status == "ok"]
+    assert back[0].time < 4_780_000
+    assert all(p.status == "ok" for p in whole.placements if p.time >= 4_780_000)
+    assert (whole.losses, whole.recoveries) == (1, 1)
+
+
+@pytest.mark.slow
+def test_a_loss_does_not_make_the_map_less_sharp(lost):
+    _, whole, early = lost
+    box = early.map.whole()
+    known = spread((early.map.assembled(box).most >= early.map.texture.exposure).float())
+    sharp = []
+    for m in (early.map, whole.map):
+        strength = m.strength(m.assembled(box))
+        slope = strength[:-1].diff(dim=1).square() + strength[:, :-1].diff(dim=0).square()
+        sharp.append(float((slope * known[:-1, :-1]).sum()))
+    assert sharp[1] >= sharp[0]
+
+
+@pytest.mark.slow
+def test_a_camera_that_stops_stands_still_draws_nothing_and_is_followed_when_it_starts(shared):
+    recording = open(shared / "data/sim/stop_and_go_sim")
+    tracks = track(recording)
+    found = list(tracks)
+    path = tracks.trajectory()
+    for first, last in ((0.0, 0.5), (1.5, 2.0), (2.7, 3.1), (3.5, 4.0)):  # s; 40 ms at each end belong to a window with motion
+        rest = (path.time > first * 1e6 + 40_000) & (path.time < last * 1e6 - 40_000)
+        assert rest.sum() > 5
+        position = path.pose.t[rest]
+        assert float((position - position[0]).norm(dim=-1).max()) < 5e-4 * (last - first) * tracks.map.plane.distance.item()
+        assert not [k.time for k in tracks.map.keyframes if first * 1e6 + 40_000 < k.time < last * 1e6 - 40_000]
+    assert "lost" not in {one.status for one in found}
+    error = score(path, recording.truth, recording.plane)
+    assert error.percent_of_distance < 0.7
+    assert error.orientation_rmse_deg < 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["shapes_lost_sim", "poster_6dof_sim", "shapes_6dof_sim"])
+def test_a_kidnapped_camera_is_found_on_the_map_of_the_first_half(shared, name, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
+    from lost import Half, kidnapped
+
+    found = kidnapped(Half.of(open(shared / "data/sim" / name)), 6)
+    assert found["wrong"] == 0
+    assert found["within 2 px, 1 deg"] >= 5

@@ -26,13 +26,14 @@ from torchcmax.slam.record import ALONG, FEW, GAP, NOISE, UNSURE, Placement, Sig
 from torchcmax.slam.relocalize import Glimpse, Grid, search_near
 from torchcmax.slam.seek import Searching, Seeker, before_plane, covariance_of
 from torchcmax.slam.sense import beyond_chance, decided, name_of, support
-from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, doubt, front, rays_of, speed
+from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, doubt, front, rays_of, speed, step
 
 FIRST_SIGMA = 0.005, 0.005, 0.2, 0.2  # of the last start window: turn, shift, angular velocity, velocity
 FOUND_SIGMA = 0.01, 0.01, 0.3, 0.3  # of a camera that was found near
 REST = 0.05  # rad/s and distances/s that a still camera may move, one sigma
 BORDER = 4  # px from one ray of the sensor's edge to the next
 LEAST = 0.5  # share of the first windows that are enough where the camera comes to rest
+TRAIL = 64  # windows of a lost camera that are kept, to be tracked when it is found
 ROUNDS = 2  # of joint optimization where two maps are joined
 
 
@@ -90,6 +91,7 @@ class Run:
         self.belief: Belief | None = None
         self.placements: list[Placement] = []
         self.gathered: list[Gathered] = []
+        self.trail: deque[tuple[Seen, Placement]] = deque(maxlen=TRAIL)  # windows since the camera was lost
         self.early: list[tuple[Seen, Front | None]] = []  # windows before there is anything to tell of them
         self.motion: Motion | None = None  # before a wall, while there is no map
         self.seeker: Seeker | None = None
@@ -112,7 +114,7 @@ class Run:
             if self._support(first)[1]:
                 self.source.skip(first.ray.shape[1])
                 return self._seen(first)
-            self.motion = self._front(first).motion
+            self.motion = self.shown(first).motion
         return self._seen(self._take(replace(still(rest()), motion=self.motion), WALL))
 
     def _take(self, state: State, plane: Plane) -> Window | None:
@@ -140,7 +142,7 @@ class Run:
         beyond = beyond_chance(supported, chance)
         return beyond, how.still and chance < how.dense and beyond < how.noise
 
-    def _front(self, window: Window) -> Front:
+    def shown(self, window: Window) -> Front:
         """What a window shows alone, before a wall, from the last motion on."""
         blur = (4.0, 2.0, 1.0) if self.motion is None else (2.0, 1.0)
         search = Search(blur, margin=self.options.tracking.search.margin)
@@ -154,8 +156,10 @@ class Run:
     def wander(self, seen: Seen, reason: str = "") -> Iterator[Track]:
         """A window while there is no map to track it on: gathered for a new one, and searched for in the old one."""
         window = seen.window
-        alone = None if seen.noise else self._front(window)
+        alone = None if seen.noise else self.shown(window)
         self.placements.append(Placement(seen.time, "lost" if self.sites else "still"))
+        if not seen.noise:
+            self.trail.append((seen, self.placements[-1]))
         number, early = len(self.placements) - 1, self.index == 0
         if early:
             self.early.append((seen, alone))
@@ -223,6 +227,7 @@ class Run:
                 break
             placement.lose()
         self.site, self.weak_since, self.gathered, self.motion = None, None, [], None
+        self.trail.clear()
         self.losses += 1
 
     def _seek(self, window: Window, motion: Motion, normal: Tensor) -> bool:
@@ -235,29 +240,37 @@ class Run:
             self.seeker = Seeker(self.sites[0].map, self.canvas, self.sensor, self.rays, searching)
             if self.given is not None and self.index == 0:
                 self.seeker.guess(window, motion, normal)
-        path = self.seeker.offer(window, motion, normal)
-        if path is None:
+        found = self.seeker.offer(window, motion, normal)
+        if found is None:
             return False
         self.seeker.close()
         self.seeker = None
-        self._arrive(self.sites[0], path)
+        self._arrive(self.sites[0], found)
         return True
 
-    def _arrive(self, home: Site, path: list[Belief]) -> None:
-        """The camera was found: what it drew meanwhile is joined, and it goes on in the first map."""
+    def _arrive(self, home: Site, now: Belief) -> None:
+        """The camera was found: what it drew meanwhile is joined, or its way here is tracked backwards, and it goes on in the first map."""
         if self.site is not None:
-            self._join(home, self.site, path[-1])
+            self._join(home, self.site, now)
         else:
-            there = {int(belief.time[0]): belief for belief in path}
-            for placement in self.placements[::-1]:
-                if placement.time < min(there):
-                    break
-                if placement.site is None and placement.time in there:
-                    state = there[placement.time].state
-                    placement.hang(home, nearest(home.map, state.pose), state, "ok")
-            self.belief = path[-1]
+            self.belief = now
+            self._trace(home, now)
         self.site, self.weak_since, self.gathered, self.motion = home, None, [], None
         self.recoveries += 1
+
+    def _trace(self, home: Site, now: Belief) -> None:
+        """The windows before a camera was found, the last one first, as long as they fit."""
+        least = self.options.sensing.weak * median(home.usual) if home.usual else 0.0
+        for seen, placement in reversed(self.trail):
+            before = now.at(seen.window.middle, self.options.tracking.acceleration)
+            sight = self.sight(home, seen.window, before)
+            if sight is None:
+                return
+            found = step(seen.window, self.canvas, before, [sight], self.options.tracking, self.options.model)
+            now, strength = found.after, float(found.match.strength[0])
+            if strength <= least or doubt(now, home.map.plane, self.rays, self.canvas.focal) >= self.options.sensing.certain:
+                return
+            placement.hang(home, nearest(home.map, now.state.pose), now.state, "ok")
 
     def _join(self, home: Site, local: Site, now: Belief) -> None:
         """Two maps become one, where what the second one drew fits the first; a given map stays as it is, and is only told where."""

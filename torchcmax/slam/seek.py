@@ -28,16 +28,11 @@ FORGET = 0.3  # share of `accept` below which a place is given up at once
 
 @dataclass
 class Candidate:
-    """A place that is followed: what is believed of a camera there, window by window, its scores, and px of motion since it was found."""
+    """A place that is followed: what is believed of a camera there, its scores, and px of motion since it was found."""
 
-    path: list[Belief]
+    belief: Belief
     scores: list[float]
     moved: float = 0.0
-
-    @property
-    def belief(self) -> Belief:
-        """Now."""
-        return self.path[-1]
 
     @property
     def score(self) -> float:
@@ -81,11 +76,8 @@ class Seeker:
         self.candidates = self._kept(found_at(glimpse, self.grid, every, self.how.rounds), window)
         self.guessed = bool(self.candidates)
 
-    def offer(self, window: Window, motion: Motion, normal: Tensor) -> list[Belief] | None:
-        """The next window [1], with what it shows alone before a plane with this normal.
-
-        -> where the camera was in the last windows, this one at the end, once that is sure
-        """
+    def offer(self, window: Window, motion: Motion, normal: Tensor) -> Belief | None:
+        """The next window [1], with what it shows alone before a plane with this normal; where the camera is, once that is sure."""
         start = int(window.start[0])
         self.candidates = self._merged(self._followed(self.candidates, window, first=self.guessed))
         self.guessed = False
@@ -116,7 +108,7 @@ class Seeker:
         """The best places, as candidates."""
         time, likely = window.middle, LIKELY * self.how.accept
         scores = [score for score in found.score.tolist()[:MOST] if score >= likely]
-        return [Candidate([Belief(time, found.state[i : i + 1], covariance_of(SIGMA))], [score]) for i, score in enumerate(scores)]
+        return [Candidate(Belief(time, found.state[i : i + 1], covariance_of(SIGMA)), [score]) for i, score in enumerate(scores)]
 
     def _followed(self, candidates: list[Candidate], window: Window, first: bool = False) -> list[Candidate]:
         """Each place, one window on, without those that fit no more; first: it is the window that they were found by."""
@@ -129,8 +121,7 @@ class Seeker:
             found = step(window, self.canvas, before, [sight], self.tracking, self.model)
             score = self.judge(window, found.after.state)
             moved = speed(found.after.state, self.map.plane, self.rays, self.canvas.focal) * float(window.duration[0])
-            path = [found.after] if first else [*one.path, found.after]
-            after = Candidate(path, [*one.scores, score], one.moved + moved)
+            after = Candidate(found.after, [*one.scores, score], one.moved + moved)
             if score >= FORGET * self.how.accept and after.score >= LIKELY * self.how.accept:
                 alive.append(after)
         return alive
@@ -168,13 +159,13 @@ class Seeker:
         """px that the image may be off at a place, one sigma."""
         return doubt(one.belief, self.map.plane, self.rays, self.canvas.focal)
 
-    def _polished(self, best: Candidate, window: Window) -> list[Belief]:
-        """The way of the best place; where there is a better one around it, that alone."""
+    def _polished(self, best: Candidate, window: Window) -> Belief:
+        """The best place, or a better one around it."""
         motion, there = before_plane(best.belief.state, self.grid.plane)
         near = search_near(Glimpse.of(window, motion, there.normal, self.sensor, self.grid.border), self.grid, best.belief.state)
         if float(near.score[0]) < BETTER * best.scores[-1]:
-            return best.path
-        return [Belief(best.belief.time, near.state[:1], covariance_of(SIGMA))]
+            return best.belief
+        return Belief(best.belief.time, near.state[:1], covariance_of(SIGMA))
 
     def close(self) -> None:
         """Ends the thread."""
