@@ -180,3 +180,20 @@ def test_loss_and_recovery_repeat_to_the_bit(recording):
     one, other = (with_gap(recording, SLAM)[0] for _ in range(2))
     assert torch.equal(one.trajectory().pose.t, other.trajectory().pose.t)
     assert [p.status for p in one.placements()] == [p.status for p in other.placements()]
+
+
+def test_motion_that_is_too_short_for_a_plane_is_lost_and_the_map_begins_behind_it(recording):
+    system, (found,) = run(recording, (None, 0.8), through=noisy(recording, (0, 100_000), (150_000, 250_000)))
+    assert {one.status for one in inside(found, 0, 150_000)} == {"lost"}
+    assert {one.status for one in inside(found, 150_000, 250_000)} <= {"still", "lost"}
+    assert system.maps[0].keyframes[0].time > 250_000
+
+
+def test_a_camera_that_stops_soon_has_a_map_and_stands_where_it_stopped(recording):
+    _, (found,) = run(recording, (None, 0.4), through=noisy(recording, (180_000, 400_000)))
+    moving, resting = inside(found, 0, 180_000), inside(found, 180_000, 400_000)
+    assert {one.status for one in moving} == {"start"}
+    assert {one.status for one in resting} == {"still"}
+    assert all(torch.equal(one.state.pose.t, resting[0].state.pose.t) for one in resting)
+    apart = [float((one.state.pose.t - resting[0].state.pose.t).norm()) for one in moving]
+    assert apart[-1] < apart[0] / 4

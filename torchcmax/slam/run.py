@@ -96,7 +96,8 @@ class Run:
         self.motion: Motion | None = None  # before a wall, while there is no map
         self.seeker: Seeker | None = None
         self.grid: tuple[Map, int, Grid] | None = None
-        self.weak_since: int | None = None
+        self.weak_since: int | None = None  # µs, of windows that met few edges; and of those of which it was unsure where
+        self.unsure_since: int | None = None
         self.ended: int | None = None  # µs of the last window's end
         self.index = self.losses = self.recoveries = self.joins = 0
 
@@ -168,6 +169,9 @@ class Run:
         if alone is None:  # at rest: what was gathered is enough for a map, or forgotten
             if len(self.gathered) >= max(2, LEAST * self.options.mapping.first):
                 yield from self._begin()
+            elif self.gathered:
+                for placement in self.placements:
+                    placement.status = placement.status if placement.site else "lost"
             self.gathered, self.motion = [], None
             return
         self.motion = alone.motion
@@ -196,12 +200,13 @@ class Run:
         keyframes = self.site.map.keyframes
         for i, g in enumerate(gathered):
             self.placements[g.number].hang(self.site, i, keyframes[i].state, "start")
-        first = still(keyframes[0].state.later(-keyframes[0].seconds / 2).pose)
-        for placement in self.placements:  # at rest until it began to move
+        first, last = still(keyframes[0].state.later(-keyframes[0].seconds / 2).pose), still(keyframes[-1].state.pose)
+        for number, placement in enumerate(self.placements):  # at rest until it began to move, or from then on
             if placement.site is None and placement.status == "still":
-                placement.hang(self.site, 0, first, "still")
+                before = number < gathered[0].number
+                placement.hang(self.site, 0 if before else len(keyframes) - 1, first if before else last, "still")
         self.belief = Belief(torch.tensor([keyframes[-1].time]), keyframes[-1].state, covariance_of(FIRST_SIGMA))
-        self.weak_since = None
+        self._anew(self.site)
         yield from self._early_tracks()
 
     def _early_tracks(self) -> Iterator[Track]:
@@ -221,12 +226,13 @@ class Run:
         return self._track(seen, Placement(seen.time, "lost", site), Signs(seen.supported, 0.0, 0.0), reason, alone, state=state)
 
     def lose(self) -> None:
-        """From now on nothing is believed of where the camera is, nor of the windows in which it met few edges before."""
+        """From now on nothing is believed of where the camera is, nor of the windows in which it met few edges, or was unsure, before."""
+        since = self.unsure_since if self.weak_since is None else self.weak_since
         for placement in self.placements[::-1]:
-            if self.weak_since is None or placement.time < self.weak_since:
+            if since is None or placement.time < since:
                 break
             placement.lose()
-        self.site, self.weak_since, self.gathered, self.motion = None, None, [], None
+        self._anew(None)
         self.trail.clear()
         self.losses += 1
 
@@ -255,8 +261,13 @@ class Run:
         else:
             self.belief = now
             self._trace(home, now)
-        self.site, self.weak_since, self.gathered, self.motion = home, None, [], None
+        self._anew(home)
         self.recoveries += 1
+
+    def _anew(self, site: Site | None) -> None:
+        """From now on the camera is here, and nothing is held against it."""
+        self.site, self.gathered, self.motion = site, [], None
+        self.weak_since = self.unsure_since = None
 
     def _trace(self, home: Site, now: Belief) -> None:
         """The windows before a camera was found, the last one first, as long as they fit."""
@@ -350,6 +361,7 @@ class Run:
         if not site.usual or strength > how.weak * median(site.usual):
             site.usual.append(strength)
             self.weak_since = None
+            self.unsure_since = None if not unsure >= how.certain else time if self.unsure_since is None else self.unsure_since
             return ("lost", UNSURE) if unsure >= how.hopeless else ("weak", UNSURE) if unsure >= how.certain else ("ok", "")
         self.weak_since = time if self.weak_since is None else self.weak_since
         return "lost" if (time - self.weak_since) * 1e-6 > how.patience else "weak", FEW
