@@ -82,12 +82,16 @@ class Relocalizing:
     """s at most from one search to the next; they begin at `wait` and double."""
 
     def __post_init__(self) -> None:
-        right = self.cell >= 1 and 0 < self.turn <= 360 and self.scale > 1 and self.candidates >= 1 and self.starts >= 1
-        if not (right and self.tilts and self.rounds and min(self.confirm) >= 0 and 0 < self.wait <= self.again):
-            raise ValueError(
-                "relocalizing wants cell, candidates and starts of at least 1, a turn of up to 360, a scale above 1, tilts and rounds, "
-                f"and waits above 0, got {self}"
-            )
+        counts = {"cell": self.cell, "candidates": self.candidates, "starts": self.starts}
+        above = {"turn": self.turn, "wait": self.wait, "ratio": self.ratio, "loose": min(self.loose), "around": min(self.around)}
+        wrong = [f"{name} of at least 1, got {value}" for name, value in counts.items() if not value >= 1]
+        wrong += [f"{name} above 0, got {value}" for name, value in above.items() if not value > 0]
+        wrong += [f"{name} of 0 to 1, got {getattr(self, name)}" for name in ("known", "accept") if not 0 <= getattr(self, name) <= 1]
+        wrong += [] if self.turn <= 360 and self.scale > 1 else [f"a turn of up to 360 and a scale above 1, got {self.turn}, {self.scale}"]
+        wrong += [] if self.tilts and self.rounds else ["tilts and rounds, got none"]
+        wrong += [] if min(self.confirm) >= 0 and self.again >= self.wait else ["confirm of at least 0, and again not below wait"]
+        if wrong:
+            raise ValueError(f"relocalizing wants {wrong[0]}")
 
 
 @dataclass(frozen=True)

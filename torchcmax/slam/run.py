@@ -82,7 +82,7 @@ class Run:
 
     def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam, given: Map | None) -> None:
         self.number, self.canvas, self.options, self.given = number, canvas, options, given
-        self.sensor = Canvas.around(camera, 0.0)
+        self.camera, self.sensor = camera, Canvas.around(camera, 0.0)
         rays = camera.rays()
         edge = torch.cat([rays[0], rays[-1], rays[:, 0], rays[:, -1]])[::BORDER]
         self.border, self.rays = edge.float(), rays_of(camera)
@@ -139,9 +139,8 @@ class Run:
     def _support(self, window: Window) -> tuple[float, bool]:
         """How supported the events of a window are, beyond chance, and whether it is noise."""
         how = self.options.sensing
-        supported, chance = support(window, self.sensor, how.slice)
-        beyond = beyond_chance(supported, chance)
-        return beyond, how.still and chance < how.dense and beyond < how.noise
+        beyond = beyond_chance(*support(window, self.camera, how))
+        return beyond, how.still and beyond < how.noise
 
     def shown(self, window: Window) -> Front:
         """What a window shows alone, before a wall, from the last motion on."""

@@ -127,12 +127,15 @@ class Seeker:
         return alive
 
     def _merged(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Best first, and of those that fell together the best."""
+        """Best first, and of those that fell together the best, with all that was seen of it."""
         kept: list[Candidate] = []
         for one in sorted(candidates, key=lambda one: -one.score):
-            if len(kept) < MOST and all(self.apart(one.belief.state, other.belief.state) > SAME for other in kept):
+            same = next((other for other in kept if self.apart(one.belief.state, other.belief.state) <= SAME), None)
+            if same is None:
                 kept.append(one)
-        return kept
+            elif one.moved > same.moved:  # the place has been followed for longer
+                same.moved, same.scores = one.moved, [*one.scores, same.scores[-1]]
+        return kept[:MOST]
 
     def judge(self, window: Window, state: State) -> float:
         """The score of a window [1] at a state [1]."""

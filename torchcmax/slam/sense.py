@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcmax.core.camera import Canvas
+from torchcmax.core.camera import Camera
 from torchcmax.core.window import Window
 
+PARTS = 3  # slices of a busy window that are looked at
 NAMES = [f"{name}_{axis}" for name in ("turn", "shift", "omega", "v") for axis in "xyz"]
 
 
@@ -21,11 +22,11 @@ class Sensing:
     still: bool = True
     """Windows of noise hold the pose; else they are tracked as all others."""
     slice: float = 0.01
-    """s within which events of neighbouring pixels support each other."""
+    """s within which events of neighbouring pixels support each other; less, where there are many."""
+    busy: float = 0.04
+    """Events per pixel in a slice at most, so that few of them are supported by chance."""
     noise: float = 0.08
     """Share of the events, beyond what chance would bring, that are supported: a window with less is noise."""
-    dense: float = 0.5
-    """Share that chance would support from which on nothing is said: so many events are no noise."""
     weak: float = 0.5
     """Share of the usual strength below which a window is weak."""
     certain: float = 1.0
@@ -38,30 +39,34 @@ class Sensing:
     """s of weak windows, or of no events at all, after which the camera is lost."""
 
     def __post_init__(self) -> None:
-        if not (
-            self.slice > 0
-            and 0 <= self.noise < 1
-            and 0 < self.dense <= 1
-            and 0 <= self.weak <= 1
-            and self.recent >= 1
-            and self.patience > 0
-        ):
-            raise ValueError(f"sensing wants slice, patience and recent above 0 and shares of 0 to 1, got {self}")
+        above, shares = (self.slice, self.busy, self.certain, self.hopeless, self.patience), (self.noise, self.weak)
+        if not (min(above) > 0 and self.recent >= 1 and all(0 <= share <= 1 for share in shares)):
+            raise ValueError(
+                f"sensing wants slice, busy, certain, hopeless, patience and recent above 0, and noise and weak of 0 to 1, got {self}"
+            )
 
 
-def support(window: Window, canvas: Canvas, seconds: float) -> tuple[float, float]:
+def support(window: Window, camera: Camera, how: Sensing) -> tuple[float, float]:
     """The share of the events of a window [1] that have another one on one of the eight pixels around, within the same slice of time;
-    and the share that would, were they anywhere (Delbruck 2008's background activity filter, as a number)."""
-    (height, width), count = canvas.size, max(1, math.ceil(float(window.duration[0]) / seconds))
-    xy = canvas.pixels(window.ray[0]).round().long()
+    and the share that would, were they anywhere (Delbruck 2008's background activity filter, as a number).
+
+    Of a busy window, the middle.
+    """
+    (height, width), pixels = camera.size, camera.size[0] * camera.size[1]
+    most = max(2, int(PARTS * how.busy * pixels))
+    first = max(0, (window.dt.shape[1] - most) // 2)
+    ray, time, weight = (part[0, first : first + most] for part in (window.ray, window.dt, window.weight))
+    seconds = float(time[-1] - time[0])
+    count = max(1, math.ceil(seconds / how.slice), math.ceil(len(time) / (how.busy * pixels)))
+    xy = camera.project(ray.double()).round().long()
     x, y = xy[:, 0].clamp(0, width - 1), xy[:, 1].clamp(0, height - 1)
-    place = ((window.phase[0] * count).long().clamp_max(count - 1) * height + y) * width + x
-    weight = window.weight[0]
+    slot = ((time - time[0]) * (count / max(seconds, 1e-9))).long().clamp_max(count - 1)
+    place = (slot * height + y) * width + x
     image = weight.new_zeros(count * height * width).index_add_(0, place, weight).view(count, height, width)
     near = around(around(image, 1), 2) - image
     events = weight.sum().clamp_min(1)
     supported = float(((near.view(-1)[place] > 0.5) * weight).sum() / events)
-    return supported, 1 - math.exp(-8 * float(events) / image.numel())
+    return supported, 1 - math.exp(-8 * float(events) / (count * pixels))
 
 
 def around(image: Tensor, dim: int) -> Tensor:
