@@ -59,7 +59,7 @@ class Relocalizing:
     """Share of the view that the map must know."""
     candidates: int = 120
     """Places that are looked at more closely."""
-    rounds: tuple[tuple[float, int, int], ...] = ((12.0, 500, 120), (6.0, 800, 60), (3.0, 1500, 40), (1.5, 3000, 12), (0.5, 6000, 6))
+    rounds: tuple[tuple[float, int, int], ...] = ((12.0, 800, 120), (6.0, 1500, 60), (3.0, 3000, 40), (1.5, 6000, 12), (0.5, 20000, 6))
     """Of that closer look: blur of the map px, events, places that go on to the next."""
     loose: tuple[float, float] = (6.0, 3.0)
     """px that pose and motion go in a round, one sigma."""
