@@ -247,6 +247,14 @@ def test_heights_do_not_depend_on_the_unit_of_length(sheet):
     assert 0.5 < float(one.height.min()) <= float(one.height.max()) < 2
 
 
+def test_keyframes_that_lie_behind_the_plane_or_far_off_do_not_say_where_to_search(empty):
+    empty.keyframes += [glance((0.0, 0.0, 1.5)), glance((0.0, 0.0, -1000.0))]
+    height = Grid(empty, QUICK).height
+    assert float(height.min()) > 0.1
+    assert float(height.max()) < 10
+    assert Grid(empty, QUICK).hypotheses[1].isfinite().all()
+
+
 def test_the_first_place_around_is_the_expected_one_and_they_are_always_the_same(sheet, home):
     state = sheet.states[WHICH]
     one, other = (around(home, state) for _ in range(2))

@@ -203,3 +203,9 @@ def test_the_direction_that_nothing_is_known_of_is_named():
 def test_sensing_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(ValueError, match="sensing wants"):
         Sensing(**wrong)
+
+
+def test_nothing_is_decided_where_the_numbers_are_none():
+    share, directions = decided(torch.full((12, 12), float("nan"), dtype=torch.float64), torch.eye(12, dtype=torch.float64))
+    assert not share.any()
+    assert torch.equal(directions, torch.eye(12, dtype=torch.float64))

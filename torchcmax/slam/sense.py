@@ -89,7 +89,9 @@ def decided(information: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     -> shares [12] from weakest to strongest, 0 where only the prediction speaks, and the directions [12, 12], a column each: the
     eigenvectors of the information in the metric of what is known with it.
     """
-    L = torch.linalg.cholesky(information + prior)
+    L, failed = torch.linalg.cholesky_ex(information + prior)
+    if failed:  # of a camera that is nowhere, numbers may be anything
+        return torch.zeros_like(information[0]), torch.eye(len(information)).to(information)
     half = torch.linalg.solve_triangular(L, information, upper=False)
     share, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(L, half.mT, upper=False))
     directions = torch.linalg.solve_triangular(L.mT, vectors, upper=True)
