@@ -36,7 +36,7 @@ POOL = 2  # px of the window, each way, that are one point when it is laid on a 
 SHARP = 0.7, 1.0  # px of blur of the window before its strength is taken, and of window and map before they are compared
 APART = 4.0  # px, rms, that two views must be apart to be two
 ELSEWHERE = 30.0  # px, rms, from which on they are of other places
-REACH = 4.0  # times the usual height over the plane, up and down, beyond which a keyframe does not say where to search
+REACH = 2.5  # times the usual height over the plane, up and down, beyond which a keyframe does not say where to search
 FLAT = 1e-5  # variance below which there is nothing to correlate
 
 
