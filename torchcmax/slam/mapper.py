@@ -41,7 +41,7 @@ class Mapping:
     """How the first plane is estimated from them."""
     thinned: int = 6000
     """Events of each of them that are used at most."""
-    settle: int = 4
+    settle: int = 8
     """Rounds of joint optimization of the first keyframes."""
     overlap: float = 0.8
     """A window of which less is known becomes a keyframe."""
