@@ -24,8 +24,9 @@ from torchcmax.core.pose import Pose
 from torchcmax.core.state import State
 from torchcmax.io import DataNote, Recording
 from torchcmax.score import Similarity, score, similarity
+from torchcmax.slam.glimpse import Glimpse
 from torchcmax.slam.map import Map
-from torchcmax.slam.relocalize import APART, Glimpse, Grid, search_near
+from torchcmax.slam.relocalize import APART, Grid, search_near
 from torchcmax.slam.run import WALL, Run, still
 from torchcmax.slam.system import Slam, System
 from torchcmax.track import TrackOptions, load_kernels, track

@@ -1,8 +1,10 @@
 import csv
 import io
 import json
+import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -18,9 +20,11 @@ from torchcmax.core.warp import still
 from torchcmax.folder import COLUMNS, TRACKED, WINDOWS, cell, check_place, written
 from torchcmax.io import DataError, open
 from torchcmax.io.trajectory import read_trajectory
-from torchcmax.mapfile import load_map
+from torchcmax.mapfile import load_map, save_map
 from torchcmax.report import Report
 from torchcmax.score import score
+from torchcmax.slam.relocalize import Relocalizing
+from torchcmax.slam.sense import Sensing
 from torchcmax.slam.system import Slam
 from torchcmax.track import TrackOptions, track
 from torchcmax.trackreport import STATUS, TrackReport, compensation
@@ -276,3 +280,64 @@ def test_a_summary_cannot_name_files_of_others(small, tmp_path):
 def test_cells():
     assert [cell(2.0, True), cell(1 / 3, False), cell(float("nan"), False), cell(True, True)] == ["2", "0.333333333", "", "1"]
     assert len(TABLE) == len(set(TABLE))
+
+
+@pytest.fixture(scope="module")
+def gap(small, tmp_path_factory):
+    """The small recording without 0.1 s of its events, and a run that begins a second map behind them, and never finds the first."""
+    folder = tmp_path_factory.mktemp("gap") / "poster"
+    shutil.copytree(small, folder)
+    with h5py.File(folder / "events.h5", "r+") as file:
+        t = file["events/t"][()]
+        keep = (t < 200_000) | (t >= 300_000)
+        for name in ("t", "x", "y", "p"):
+            column = file[f"events/{name}"][()][keep]
+            del file[f"events/{name}"]
+            file[f"events/{name}"] = column
+    slam = replace(SLAM, sensing=Sensing(patience=0.05), relocalizing=Relocalizing(far=False))
+    return folder, report(tmp_path_factory.mktemp("lost") / "run", folder, slam=slam, end=None)
+
+
+def test_a_loss_and_what_was_tracked_behind_it_are_told(gap):
+    _, run = gap
+    summary = json.loads((run.folder / "summary.json").read_text())
+    assert (summary["losses"], summary["recoveries"], summary["maps"], summary["maps_joined"]) == (1, 0, 2, 0)
+    main, other = (m.number for m in run.tracks.atlas)
+    assert {main, other} == {0, 1}
+    assert {"map.h5", f"map_{other}.h5"} <= set(summary["files"])
+    assert [load_map(run.folder / name).number for name in ("map.h5", f"map_{other}.h5")] == [main, other]
+    lines = lines_of(run.folder / WINDOWS)
+    assert {line["map"] for line in lines} == {"0", "1"}
+    here = [line for line in lines if line["map"] == str(main)]
+    assert len(read_trajectory(run.folder / "trajectory.txt")) == len(here) < len(lines)
+    assert lines[0]["reason"] == ""
+
+
+def test_the_board_says_nothing_of_where_a_lost_camera_is(gap):
+    _, run = gap
+    found = board(run.folder)
+    status = {event.step: event.value for event in found.Scalars("window/status")}
+    lost = [step for step, value in status.items() if value == STATUS["lost"]]
+    assert lost
+    assert len(status) == len(run.table)
+    for name in ("pose/tx", "pose/rx_deg", "error/live_orientation_deg"):
+        assert not {event.step for event in found.Scalars(name)} & set(lost)
+
+
+def test_a_new_run_takes_the_place_of_every_map_of_the_last_one(gap, small):
+    folder, run = gap
+    assert list(run.folder.glob("map_*.h5"))
+    report(run.folder, folder, end=0.19)
+    assert not list(run.folder.glob("map_*.h5"))
+
+
+def test_a_run_on_a_map_of_something_else_ends_without_a_trajectory(gap, run, tmp_path):
+    m = load_map(run.folder / "map.h5")
+    m.tiles.clear()
+    save_map(tmp_path / "blank.h5", m)
+    folder, _ = gap
+    found = report(tmp_path / "run", folder, map=str(tmp_path / "blank.h5"), slam=replace(SLAM, atlas=False), end=0.15)
+    assert {line["status"] for line in lines_of(found.folder / WINDOWS)} == {"lost"}
+    assert all(line["tx"] == line["map"] == "" for line in lines_of(found.folder / WINDOWS))
+    assert "trajectory.txt" not in found.files
+    assert json.loads((found.folder / "summary.json").read_text())["error"] is None

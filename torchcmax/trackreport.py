@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -120,13 +121,22 @@ class TrackReport:
         pose = Pose(torch.cat([p.R for p in poses]).cpu().double(), torch.cat([p.t for p in poses]).cpu().double())
         set_poses(lines, pose)
         turns = torch.rad2deg(so3.log(pose.R)).tolist()
-        plane = Plane(*(part.cpu().double() for part in (self.tracks.map.plane.normal, self.tracks.map.plane.distance)))
-        live = self.judge.live(torch.tensor([line["time_us"] for line in lines]), pose, plane)
-        for line, turn, error, count in zip(lines, turns, live, keyframes, strict=True):
-            self._lines.writerow(cells(line))
+        for line, turn, error, count in zip(lines, turns, self._live(lines, pose), keyframes, strict=True):
+            self._lines.writerow(cells(line if line["status"] != "lost" else line | dict.fromkeys(POSE, math.nan)))
             board.scalars(_scalars(line, turn) | {"map/keyframes": float(count)} | error, line["index"])
         self._csv.flush()
         board.flush()
+
+    def _live(self, lines: Sequence[Row], pose: Pose) -> list[dict[str, float]]:
+        """Errors of poses [M] as far as they are known now: of the windows on the main map."""
+        m = self.tracks.map
+        here = [i for i, line in enumerate(lines) if line["status"] != "lost" and line["map"] == m.number]
+        found = [dict[str, float]() for _ in lines]
+        plane = Plane(*(part.cpu().double() for part in (m.plane.normal, m.plane.distance)))
+        live = self.judge.live(torch.tensor([lines[i]["time_us"] for i in here], dtype=torch.int64), pose[here], plane)
+        for i, error in zip(here, live, strict=True):
+            found[i] = error
+        return found
 
     def _draw(self, board: Board, track: Track, line: Row) -> None:
         """The window before | after, and the map as it is, for TensorBoard at the 1st, 2nd, 3rd, 5th, 9th ... picture."""
@@ -284,5 +294,7 @@ def _scalars(line: Row, turn: list[float]) -> dict[str, float]:
     shown["window/status"] = STATUS[line["status"]]
     if seconds > 0:
         shown["window/events_per_second"] = line["events"] / seconds
+    if line["status"] == "lost":  # nobody knows where
+        return shown
     shown |= {f"pose/{name}": line[name] for name in POSE[:3]}
     return shown | {f"pose/r{axis}_deg": value for axis, value in zip("xyz", turn, strict=True)}

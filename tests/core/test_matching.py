@@ -23,6 +23,7 @@ from torchcmax.core.match import (
     gram,
     homography,
     lookup,
+    loosely,
     match,
     sharpen,
     units,
@@ -303,3 +304,26 @@ def test_without_votes_there_is_no_variance(scene):
 def test_a_matching_without_sense_is_refused(wrong):
     with pytest.raises(ValueError, match=r"none of|matching wants"):
         Matching(**wrong)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_one_chart_serves_all_windows(scene, compiled, monkeypatch):
+    """As many of it would."""
+    if not compiled:
+        monkeypatch.setenv(kernels.SWITCH, "0")
+    task, same = task_of(scene, off=1.5), torch.zeros(2, dtype=torch.int64)
+    many = replace(task, chart=task.chart[same])
+    one = replace(task, chart=task.chart[same[:1]])
+    assert (len(one.chart.texture), len(many.chart.texture)) == (1, 2)
+    q = torch.zeros(2, SIZE, dtype=DOUBLE)
+    a, b = match(q, one, EXACT), match(q, many, EXACT)
+    torch.testing.assert_close(a.x, b.x)
+    torch.testing.assert_close(a.information, b.information)
+    torch.testing.assert_close(a.strength, b.strength)
+    assert a.strength[0] != a.strength[1]
+
+
+def test_a_loose_prior_speaks_of_pose_and_motion_and_not_of_the_tilt():
+    prior = loosely(5.0, 2.0)
+    torch.testing.assert_close(prior.diagonal(), torch.tensor([0.04] * 6 + [0.25] * 6 + [0.0] * 2, dtype=DOUBLE))
+    assert torch.equal(prior, prior.diagonal().diag())

@@ -8,6 +8,7 @@ import torch
 from scenes import Scene, drawn, keyframe_of, map_of, pixels, state_of, wall
 from torch.nn.functional import avg_pool2d
 
+from torchcmax import kernels
 from torchcmax.core import so3
 from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.draw import Ink
@@ -35,7 +36,7 @@ from torchcmax.slam.relocalize import (
     search_near,
     searched,
 )  # fmt: skip
-from torchcmax.slam.seek import before_plane
+from torchcmax.slam.tracker import before_plane
 
 CAMERA = Camera.pinhole((90, 120), 100 / 120)
 QUICK = Relocalizing(turn=30.0, tilts=((0.0, 1),))
@@ -317,7 +318,7 @@ def test_where_the_map_knows_too_little_the_score_is_below_zero(sheet, home, gli
     assert float(known[0]) <= QUICK.known
 
 
-@pytest.mark.parametrize("sigma", [SHARP[1], 3.0])
+@pytest.mark.parametrize("sigma", [SHARP, 3.0])
 def test_a_score_is_the_correlation_over_what_is_known_times_the_root_of_that_share(sheet, glimpse, sigma):
     grid = Grid(drawn(sheet, range(0, len(sheet.windows), 2)), QUICK)
     grid.known[:, grid.known.shape[1] // 2 + 25 :] = 0  # part of it is forgotten
@@ -379,9 +380,12 @@ def test_a_place_is_clear_by_the_next_one_that_is_elsewhere(scores, away, clear)
     assert found.clear == pytest.approx(clear)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_camera_is_found_near(sheet, home, glimpse, sign):
+def test_a_camera_is_found_near(sheet, home, glimpse, sign, compiled, monkeypatch):
     """From 15 px and 5 degrees off."""
+    if not compiled:
+        monkeypatch.setenv(kernels.SWITCH, "0")
     turn, away = math.radians(5), sheet.states[WHICH].seen(sheet.plane).distance
     off = torch.zeros(1, 12, dtype=torch.float64)
     off[0, 2] = sign * turn

@@ -59,6 +59,7 @@ class Chart:
     """The dense part of a map around a camera.  texture [B, H, W] 0..1 on the plane seen by `view` [B, 3, 3] from the world's origin.
 
     corner [B, 2] px: where on the map the middle of the first pixel is | focal px per unit tangent
+    Where B is 1, it serves any number of windows.
     """
 
     texture: Tensor
@@ -70,6 +71,10 @@ class Chart:
     def frame(self) -> Tensor:
         """The texture with a border of nothing, as the kernels want it: [B, H + 2, W + 2]."""
         return pad(self.texture, (1, 1, 1, 1))
+
+    def __getitem__(self, rows: Tensor) -> Chart:
+        """Those of some of the windows."""
+        return self if len(self.texture) == 1 else Chart(self.texture[rows], self.corner[rows], self.view[rows], self.focal)
 
     def filled(self, images: Sequence[Tensor]) -> Tensor:
         """Images of the parts that were joined, [h, w] each, as large as the texture: [B, H, W]."""
@@ -102,6 +107,11 @@ class Match:
     strength: Tensor
     evaluations: Tensor
     converged: Tensor
+
+
+def loosely(pose: float, motion: float) -> Tensor:
+    """A prior [14, 14] for `Task`: the pose and the motion go so many px, one sigma; of the plane's tilt nothing is said."""
+    return torch.tensor([pose**-2] * 6 + [motion**-2] * 6 + [0.0] * (NUMBERS - SIZE), dtype=torch.float64).diag()
 
 
 def units(state: State, plane: Plane, seconds: Tensor, focal: float) -> Tensor:
@@ -137,9 +147,9 @@ def _flow(H_k: Tensor, dH: Tensor, ink: Ink, focal: float) -> tuple[Tensor, Tens
 
 
 def lookup(texture: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear lookup, zero outside: texture [B, H, W] | xy [B, N, 2] px -> strength [B, N], slope [B, N, 2] along x and y."""
+    """Bilinear lookup, zero outside: texture [B or 1, H, W] | xy [B, N, 2] px -> strength [B, N], slope [B, N, 2] along x and y."""
     height, width = texture.shape[1:]
-    frame = pad(texture, (1, 1, 1, 1)).to(xy).flatten(1)
+    frame = pad(texture, (1, 1, 1, 1)).to(xy).flatten(1).expand(len(xy), -1)
     point = xy + 1
     inside = (point > 0).all(-1) & (point[..., 0] < width + 1) & (point[..., 1] < height + 1)
     point = torch.where(inside[..., None], point, 0.0)
@@ -214,8 +224,7 @@ class Task:
 
     def __getitem__(self, rows: Tensor) -> Task:
         """Some of the windows."""
-        c, state, plane = self.chart, self.predicted[rows], Plane(self.plane.normal[rows], self.plane.distance[rows])
-        chart = Chart(c.texture[rows], c.corner[rows], c.view[rows], c.focal)
+        chart, state, plane = self.chart[rows], self.predicted[rows], Plane(self.plane.normal[rows], self.plane.distance[rows])
         ghosts, ground, votes = (None if part is None else part[rows] for part in (self.ghosts, self.ground, self.votes))
         ink, some = self.ink[rows], self.some[rows]
         return Task(state, plane, self.seconds[rows], chart, ink, some, self.prior[rows], self.basis, ghosts, ground, votes)  # type: ignore[arg-type]

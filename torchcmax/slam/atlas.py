@@ -13,6 +13,7 @@ from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.slam.map import Keyframe, Map
 from torchcmax.slam.relocalize import Glimpse, Grid, judged
+from torchcmax.slam.tracker import before_plane
 
 FITS = 0.4  # score that the keyframes of the one map have in the other, where it knows their view, in the median
 
@@ -58,7 +59,6 @@ def fitting(m: Map, similarity: Similarity, home: Grid, sensor: Canvas) -> list[
 
 def agreement(keyframe: Keyframe, home: Grid, sensor: Canvas) -> float:
     """The score of a keyframe in a map, below zero where the map hardly knows what it sees."""
-    there = keyframe.state.seen(home.plane)
-    motion = Motion(keyframe.state.motion.omega, keyframe.state.motion.velocity / there.distance[:, None])
+    motion, there = before_plane(keyframe.state, home.plane)
     glimpse = Glimpse.drawn(keyframe.ink, keyframe.seconds, motion, there.normal, sensor, home.border)
     return float(judged(glimpse, home, keyframe.state)[0][0])

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchcmax import kernels
 from torchcmax.core.draw import Ink
 from torchcmax.core.joint import Frames, Joint, Solved, optimize_chain
-from torchcmax.core.match import NUMBERS, Match, Matching, Task, lookup, match, units
+from torchcmax.core.match import NUMBERS, Match, Matching, Task, lookup, loosely, match, units
 from torchcmax.core.model import Displacement
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
@@ -26,8 +26,6 @@ ROUGH = 10.0  # tolerances that are enough to tell the twin plane
 WORSE = 0.95  # share of what the newest keyframe met in the image of the others that it must meet after a joint optimization
 MOST_TILT = 0.05  # rad in a round
 LOOSE = 5.0, 2.0  # px: how far the pose and the motion of a keyframe go in a round, one sigma
-
-
 Free = tuple[bool, bool]
 
 
@@ -216,5 +214,5 @@ def before_others(m: Map, number: int, matching: Matching, basis: Tensor | None 
     ghosts, ground = m.by_chance(few, H_k, area)
     basis = torch.eye(NUMBERS, SIZE, dtype=torch.float64) if basis is None else basis
     (chart,) = area.charts
-    loose = torch.tensor([LOOSE[0] ** -2] * 6 + [LOOSE[1] ** -2] * 6 + [0.0] * 2, dtype=torch.float64)
-    return Task(keyframe.state, m.plane, keyframe.seconds, chart, few, keyframe.ink.sample(SOME), loose.diag()[None], basis, ghosts, ground)
+    loose = loosely(*LOOSE)[None]
+    return Task(keyframe.state, m.plane, keyframe.seconds, chart, few, keyframe.ink.sample(SOME), loose, basis, ghosts, ground)

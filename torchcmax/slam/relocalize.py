@@ -20,20 +20,18 @@ from torchcmax import kernels
 from torchcmax.core import so3
 from torchcmax.core.camera import NEAREST, Canvas
 from torchcmax.core.contrast import blur
-from torchcmax.core.draw import Ink, draw
-from torchcmax.core.match import NUMBERS, Chart, Matching, Task, match
+from torchcmax.core.draw import draw
+from torchcmax.core.match import NUMBERS, Chart, Matching, Task, loosely, match
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import SIZE, State
-from torchcmax.core.warp import TERMS, polynomial
-from torchcmax.core.window import Window
+from torchcmax.slam.glimpse import POOL, Glimpse
 from torchcmax.slam.map import Map
 from torchcmax.slam.tiles import spread
 from torchcmax.slam.tracker import SOME
 
 CHUNK = 32  # hypotheses that are correlated at a time
 PEAKS = 4  # places of each hypothesis that are kept
-POOL = 2  # px of the window, each way, that are one point when it is laid on a map
-SHARP = 0.7, 1.0  # px of blur of the window before its strength is taken, and of window and map before they are compared
+SHARP = 1.0  # px of blur of window and map before they are compared
 APART = 4.0  # px, rms, that two views must be apart to be two
 ELSEWHERE = 30.0  # px, rms, from which on they are of other places
 REACH = 2.5  # times the usual height over the plane, up and down, beyond which a keyframe does not say where to search
@@ -93,63 +91,6 @@ class Relocalizing:
         wrong += [] if min(self.confirm) >= 0 and self.again >= self.wait else ["confirm of at least 0, and again not below wait"]
         if wrong:
             raise ValueError(f"relocalizing wants {wrong[0]}")
-
-
-@dataclass(frozen=True)
-class Glimpse:
-    """What one window shows by itself.
-
-    seconds [1] | motion [1] at its middle, velocity in distances of the plane then | ink [1, N] | canvas: as large as the sensor
-    strength [H, W] of its edges there, 0..1 | inside [H, W]: 1 on the sensor
-    """
-
-    seconds: Tensor
-    motion: Motion
-    ink: Ink
-    canvas: Canvas
-    strength: Tensor
-    inside: Tensor
-
-    @classmethod
-    def of(cls, window: Window, motion: Motion, normal: Tensor, canvas: Canvas, border: Tensor) -> Glimpse:
-        """From the motion [1] that makes a window [1] sharp before a plane with this normal [1, 3]."""
-        return cls.drawn(Ink.of(window, window.weight), window.duration.double(), motion, normal, canvas, border)
-
-    @classmethod
-    def drawn(cls, ink: Ink, seconds: Tensor, motion: Motion, normal: Tensor, canvas: Canvas, border: Tensor) -> Glimpse:
-        """Of events [1, N] that last `seconds` [1]."""
-        H_k = polynomial(motion.omega * seconds[:, None], motion.velocity * seconds[:, None], normal, TERMS)
-        image = blur(draw(H_k.to(ink.x), ink, canvas, torch.zeros(1, dtype=torch.int64)), SHARP[0])[0]
-        typical = image.square().sum() / image.sum().clamp_min(1e-9)
-        low, high = border[:, :2].amin(0), border[:, :2].amax(0)
-        x, y = axes_of(canvas)
-        inside = ((y >= low[1]) & (y <= high[1]))[:, None] & ((x >= low[0]) & (x <= high[0]))
-        return cls(seconds, motion, ink, canvas, image / (image + typical.clamp_min(1e-9)), inside.to(image))
-
-    def pooled(self, pool: int, sigma: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Points on the sensor, a square of `pool` px each: rays [3, N] and strength [N], of the image blurred by sigma px."""
-        soft = blur(self.strength[None], sigma)[0] if sigma else self.strength
-        strength, inside = (avg_pool2d(part[None], pool)[0] for part in (soft, self.inside))
-        x, y = (
-            axis[: n // pool * pool].view(-1, pool).mean(1) for axis, n in zip(axes_of(self.canvas), self.canvas.size[::-1], strict=True)
-        )
-        keep = inside > 0.5
-        x, y = x.expand_as(strength)[keep], y[:, None].expand_as(strength)[keep]
-        ray = torch.stack([x, y, torch.ones_like(x)])
-        return ray, strength[keep]
-
-    @cached_property
-    def points(self) -> tuple[Ink, Ink]:
-        """The image as points to draw: with its strength as weight, and with one."""
-        ray, strength = self.pooled(POOL)
-        x, y, one = (part[None].contiguous() for part in ray)
-        return Ink(x, y, torch.zeros_like(x), strength[None].contiguous()), Ink(x, y, torch.zeros_like(x), one)
-
-
-def axes_of(canvas: Canvas) -> tuple[Tensor, Tensor]:
-    """The coordinates of a canvas' columns and rows as rays (x, y, 1)."""
-    (height, width), (x, y) = canvas.size, canvas.centre
-    return (torch.arange(width, dtype=torch.float32) - x) / canvas.focal, (torch.arange(height, dtype=torch.float32) - y) / canvas.focal
 
 
 class Grid:
@@ -303,7 +244,7 @@ def found_at(glimpse: Glimpse, grid: Grid, pose: Pose, rounds: tuple[tuple[float
     state = State(pose, Motion(glimpse.motion.omega.expand(many, 3), glimpse.motion.velocity * height))
     for sigma, events, keep in rounds:
         state = refined(glimpse, grid, state, sigma, events)
-        score, known = judged(glimpse, grid, state, max(SHARP[1], sigma))
+        score, known = judged(glimpse, grid, state, max(SHARP, sigma))
         best = distinct(grid, state, score, keep)
         state, score, known = state[best], score[best], known[best]
     xy = seen_at(grid, state)
@@ -314,14 +255,13 @@ def refined(glimpse: Glimpse, grid: Grid, state: State, sigma: float, events: in
     """States [K] matched to the map, blurred by sigma px, by some of the window's events."""
     count, how, rows = len(state.pose.t), grid.how, torch.zeros(len(state.pose.t), dtype=torch.int64)
     ink = glimpse.ink.thinned(max(1, -(-glimpse.ink.x.shape[1] // events)))[rows]
-    loose = torch.tensor([how.loose[0] ** -2] * 6 + [how.loose[1] ** -2] * 6 + [0.0] * (NUMBERS - SIZE), dtype=torch.float64)
-    prior, basis = loose.diag().expand(count, -1, -1), torch.eye(NUMBERS, SIZE, dtype=torch.float64)
+    prior, basis = loosely(*how.loose).expand(count, -1, -1), torch.eye(NUMBERS, SIZE, dtype=torch.float64)
     plane, seconds = grid.plane.repeated(count), glimpse.seconds.expand(count)
     task = Task(state, plane, seconds, grid.chart(sigma), ink, glimpse.ink.sample(SOME)[rows], prior, basis)
     return match(torch.zeros(count, SIZE, dtype=torch.float64), task, Matching(every=1).coarse(sigma)).state
 
 
-def judged(glimpse: Glimpse, grid: Grid, state: State, sigma: float = SHARP[1]) -> tuple[Tensor, Tensor]:
+def judged(glimpse: Glimpse, grid: Grid, state: State, sigma: float = SHARP) -> tuple[Tensor, Tensor]:
     """Scores [K] of states: the correlation of window and map there, times the root of the share that the map knows; and that share [K]."""
     ray, S = glimpse.pooled(max(POOL, round(sigma)), sigma)
     there = state.placement(grid.plane.repeated(len(state.pose.t)), grid.view).float() @ ray  # [K, 3, N]

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,14 +18,16 @@ from torchcmax.core.pose import Motion, Pose, Trajectory
 from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.slam.atlas import Similarity, fitting
+from torchcmax.slam.glimpse import Glimpse
 from torchcmax.slam.map import Keyframe, Map
 from torchcmax.slam.mapper import first_plane, rebased, settled
 from torchcmax.slam.options import Slam
 from torchcmax.slam.record import ALONG, FEW, GAP, NOISE, UNSURE, Placement, Signs, Site, Status, Track
-from torchcmax.slam.relocalize import Glimpse, Grid, search_near
-from torchcmax.slam.seek import Searching, Seeker, before_plane, covariance_of
-from torchcmax.slam.sense import beyond_chance, decided, name_of, support
-from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, doubt, front, rays_of, speed, step
+from torchcmax.slam.relocalize import Grid, search_near
+from torchcmax.slam.seek import Searching, Seeker
+from torchcmax.slam.sense import decided, name_of
+from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, before_plane, covariance_of, doubt, front, rays_of, step
+from torchcmax.slam.windows import Seen, Source, Windows
 
 FIRST_SIGMA = 0.005, 0.005, 0.2, 0.2  # of the last start window: turn, shift, angular velocity, velocity
 FOUND_SIGMA = 0.01, 0.01, 0.3, 0.3  # of a camera that was found near
@@ -37,33 +38,8 @@ TRAIL = 64  # windows of a lost camera that are kept, to be tracked when it is f
 ROUNDS = 2  # of joint optimization where two maps are joined
 
 
-class Source(Protocol):
-    """Consecutive windows of a recording, whose size the caller decides: as io.Stream."""
-
-    def look(self, events: int, seconds: float) -> Window | None:
-        """The next window, without going past it; None at the end."""
-
-    def skip(self, events: int) -> None:
-        """Goes past the first events of what was last looked at."""
-
-
 class TooShort(ValueError):
     """A recording that ends before there is anything to begin with."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A window with what is known of it before it is tracked: whether it is noise, or comes after a gap."""
-
-    window: Window
-    supported: float
-    noise: bool
-    gap: bool
-
-    @property
-    def time(self) -> int:
-        """µs of its middle."""
-        return int(self.window.middle[0])
 
 
 @dataclass(frozen=True)
@@ -78,7 +54,7 @@ class Gathered:
 class Run:
     """A camera on its way."""
 
-    source: Source
+    windows: Windows  # where it is begun
 
     def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam, given: Map | None) -> None:
         self.number, self.canvas, self.options, self.given = number, canvas, options, given
@@ -88,6 +64,7 @@ class Run:
         self.border, self.rays = edge.float(), rays_of(camera)
         self.sites: list[Site] = [] if given is None else [self._site(given)]
         self.site: Site | None = None  # where the camera is; None while it is lost
+        self.last: Site | None = self.sites[0] if self.sites else None  # where it was last
         self.belief: Belief | None = None
         self.placements: list[Placement] = []
         self.gathered: list[Gathered] = []
@@ -98,58 +75,31 @@ class Run:
         self.grid: tuple[Map, int, Grid] | None = None
         self.weak_since: int | None = None  # µs, of windows that met few edges; and of those of which it was unsure where
         self.unsure_since: int | None = None
-        self.ended: int | None = None  # µs of the last window's end
         self.index = self.losses = self.recoveries = self.joins = 0
 
     # windows
 
+    def begin(self, source: Source) -> None:
+        """The windows that `next` gives come from here."""
+        self.windows = Windows(source, self.camera, self.options, self.rays, self.canvas.focal)
+
     def next(self) -> Seen | None:
         """The next window: as long as the image takes to move by the displacement wanted."""
-        how = self.options.tracking
         if self.site is not None:
-            return self._seen(self._take(self._belief.state, self.site.map.plane))
+            return self.windows.past(self.windows.sized(self._belief.state, self.site.map.plane))
         if self.motion is None:
-            first = self.source.look(how.most, how.seconds)
-            if first is None:
-                return None
-            if self._support(first)[1]:
-                self.source.skip(first.ray.shape[1])
-                return self._seen(first)
-            self.motion = self.shown(first).motion
-        return self._seen(self._take(replace(still(rest()), motion=self.motion), WALL))
-
-    def _take(self, state: State, plane: Plane) -> Window | None:
-        how = self.options.tracking
-        seconds = min(how.seconds, how.displacement / max(speed(state, plane, self.rays, self.canvas.focal), 1e-6))
-        found = self.source.look(how.most, seconds)
-        if found is not None and found.ray.shape[1] < how.fewest and seconds < how.seconds:
-            found = self.source.look(how.fewest, how.seconds)
-        if found is not None:
-            self.source.skip(found.ray.shape[1])
-        return found
-
-    def _seen(self, window: Window | None) -> Seen | None:
-        if window is None:
-            return None
-        start, before = int(window.start[0]), self.ended
-        self.ended = start + round(float(window.duration[0]) * 1e6)
-        late = before is not None and (start - before) * 1e-6 > self.options.sensing.patience
-        return Seen(window, *self._support(window), late)
-
-    def _support(self, window: Window) -> tuple[float, bool]:
-        """How supported the events of a window are, beyond chance, and whether it is noise."""
-        how = self.options.sensing
-        beyond = beyond_chance(*support(window, self.camera, how))
-        return beyond, how.still and beyond < how.noise
+            first = self.windows.longest()
+            if first is None or first.noise:
+                return self.windows.past(first)
+            self.motion = self.shown(first.window).motion
+        return self.windows.past(self.windows.sized(replace(still(rest()), motion=self.motion), WALL))
 
     def shown(self, window: Window) -> Front:
         """What a window shows alone, before a wall, from the last motion on."""
-        blur = (4.0, 2.0, 1.0) if self.motion is None else (2.0, 1.0)
+        blur, state = ((4.0, 2.0, 1.0), still(rest())) if self.motion is None else ((2.0, 1.0), replace(still(rest()), motion=self.motion))
         search = Search(blur, margin=self.options.tracking.search.margin)
-        state = still(rest()) if self.motion is None else replace(still(rest()), motion=self.motion)
-        return front(
-            window, self.canvas, state, WALL, replace(self.options.tracking, look=self.options.start, search=search), self.options.model
-        )
+        how = replace(self.options.tracking, look=self.options.start, search=search)
+        return front(window, self.canvas, state, WALL, how, self.options.model)
 
     # before a map, and lost
 
@@ -221,7 +171,7 @@ class Run:
     def _lost(self, seen: Seen, alone: Front | None, reason: str) -> Track:
         """A window of a camera of which nothing is known: it stays where it was."""
         state = still(rest() if self.belief is None else self.belief.state.pose)
-        site = self.sites[-1] if self.sites else self._site(Map(WALL, self.canvas.focal, self.border, self.options.texture))
+        site = self.last or self._site(Map(WALL, self.canvas.focal, self.border, self.options.texture))
         return self._track(seen, Placement(seen.time, "lost", site), Signs(seen.supported, 0.0, 0.0), reason, alone, state=state)
 
     def lose(self) -> None:
@@ -265,7 +215,7 @@ class Run:
 
     def _anew(self, site: Site | None) -> None:
         """From now on the camera is here, and nothing is held against it."""
-        self.site, self.gathered, self.motion = site, [], None
+        self.site, self.last, self.gathered, self.motion = site, site or self.last, [], None
         self.weak_since = self.unsure_since = None
 
     def _trace(self, home: Site, now: Belief) -> None:
@@ -360,8 +310,11 @@ class Run:
         if not site.usual or strength > how.weak * median(site.usual):
             site.usual.append(strength)
             self.weak_since = None
-            self.unsure_since = None if not unsure >= how.certain else time if self.unsure_since is None else self.unsure_since
-            return ("lost", UNSURE) if unsure >= how.hopeless else ("weak", UNSURE) if unsure >= how.certain else ("ok", "")
+            if not unsure >= how.certain:
+                self.unsure_since = None
+                return "ok", ""
+            self.unsure_since = time if self.unsure_since is None else self.unsure_since
+            return "lost" if unsure >= how.hopeless else "weak", UNSURE
         self.weak_since = time if self.weak_since is None else self.weak_since
         return "lost" if (time - self.weak_since) * 1e-6 > how.patience else "weak", FEW
 
@@ -466,7 +419,7 @@ class Run:
         return track
 
 
-WALL = Plane(torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64), torch.ones(1, dtype=torch.float64))
+WALL = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))  # at distance one
 
 
 def rest() -> Pose:

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from statistics import mean
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchcmax.core.camera import Canvas
-from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.slam.map import Map
-from torchcmax.slam.relocalize import Found, Glimpse, Grid, Relocalizing, found_at, judged, search_far, search_near
-from torchcmax.slam.tracker import Belief, ModelName, Sight, Tracking, doubt, speed, step
+from torchcmax.slam.relocalize import Found, Glimpse, Grid, Relocalizing, found_at, judged, search_far, search_near, seen_at
+from torchcmax.slam.tracker import Belief, ModelName, Sight, Tracking, before_plane, covariance_of, doubt, speed, step
 
 LIKELY = 0.6  # share of `accept` that a place must score to be followed
 MOST = 4  # places that are followed at a time
 SIGMA = 0.02, 0.01, 0.5, 0.5  # of a place that was found: turn rad, shift, angular velocity rad/s, velocity distances/s
 SAME = 8.0  # px that places are apart at least
 BETTER = 1.02  # times the score that a place nearby must have to be taken instead
+RECENT = 5  # windows that make the score of a place
 FORGET = 0.3  # share of `accept` below which a place is given up at once
 
 
@@ -36,9 +37,8 @@ class Candidate:
 
     @property
     def score(self) -> float:
-        """The mean, in which the last windows count more."""
-        recent = self.scores[-5:]
-        return sum(recent) / len(recent)
+        """The mean of the last windows."""
+        return mean(self.scores[-RECENT:])
 
 
 class Searching(NamedTuple):
@@ -60,7 +60,6 @@ class Seeker:
         how = options.how
         self.grid = Grid(m, how)
         self.candidates: list[Candidate] = []
-        self.guessed = False
         self.pool = ThreadPoolExecutor(1, "torchcmax-seek")
         self.flight: Future[Found] | None = None
         self.began = self.next = 0  # µs
@@ -74,13 +73,11 @@ class Seeker:
         glimpse = Glimpse.of(window, motion, normal, self.sensor, self.map.border)
         every = Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses]))
         self.candidates = self._kept(found_at(glimpse, self.grid, every, self.how.rounds), window)
-        self.guessed = bool(self.candidates)
 
     def offer(self, window: Window, motion: Motion, normal: Tensor) -> Belief | None:
         """The next window [1], with what it shows alone before a plane with this normal; where the camera is, once that is sure."""
         start = int(window.start[0])
-        self.candidates = self._merged(self._followed(self.candidates, window, first=self.guessed))
-        self.guessed = False
+        self.candidates = self._merged(self._followed(self.candidates, window))
         if self.flight is not None:
             self.since.append(window)
             if start - self.began >= self.how.wait * 1e6 and (self.how.steady or self.flight.done()):
@@ -97,8 +94,8 @@ class Seeker:
         """What a search found, followed through the windows that came meanwhile, beside what is followed already."""
         assert self.flight is not None
         fresh = self._kept(self.flight.result(), self.since[0])
-        for i, window in enumerate(self.since):
-            fresh = self._followed(fresh, window, first=i == 0)
+        for window in self.since:
+            fresh = self._followed(fresh, window)
         self.flight, self.since = None, []
         self.pause = self.how.wait if fresh else min(2 * self.pause, self.how.again)
         self.next = self.began + round(self.pause * 1e6)
@@ -110,11 +107,11 @@ class Seeker:
         scores = [score for score in found.score.tolist()[:MOST] if score >= likely]
         return [Candidate(Belief(time, found.state[i : i + 1], covariance_of(SIGMA)), [score]) for i, score in enumerate(scores)]
 
-    def _followed(self, candidates: list[Candidate], window: Window, first: bool = False) -> list[Candidate]:
-        """Each place, one window on, without those that fit no more; first: it is the window that they were found by."""
+    def _followed(self, candidates: list[Candidate], window: Window) -> list[Candidate]:
+        """Each place, one window on, or at the window that it was found by, without those that fit no more."""
         alive: list[Candidate] = []
         for one in candidates:
-            before = one.belief if first else one.belief.at(window.middle, self.tracking.acceleration)
+            before = one.belief.at(window.middle, self.tracking.acceleration)
             sight = Sight.of(self.map, before.state, window.duration.double())
             if sight is None:
                 continue
@@ -144,8 +141,7 @@ class Seeker:
 
     def apart(self, one: State, other: State) -> float:
         """px, rms, between what two cameras [1] see."""
-        there = [self.rays @ s.placement(self.map.plane, self.map.view)[0].mT for s in (one, other)]
-        xy = [ray[:, :2] / ray[:, 2:] * self.map.focal for ray in there]
+        xy = seen_at(self.grid, State.join([one, other]))
         return float((xy[0] - xy[1]).square().sum(-1).mean().sqrt())
 
     def _sure(self) -> Candidate | None:
@@ -173,14 +169,3 @@ class Seeker:
     def close(self) -> None:
         """Ends the thread."""
         self.pool.shutdown(wait=False, cancel_futures=True)
-
-
-def before_plane(state: State, plane: Plane) -> tuple[Motion, Plane]:
-    """The motion of a camera [1] in its own distances from a plane, and how it sees that."""
-    there = state.seen(plane)
-    return Motion(state.motion.omega, state.motion.velocity / there.distance[:, None]), there
-
-
-def covariance_of(sigma: tuple[float, float, float, float]) -> Tensor:
-    """[1, 12, 12], of turn, shift, angular velocity and velocity, one sigma."""
-    return torch.tensor(sigma, dtype=torch.float64).repeat_interleave(3).square().diag()[None]

@@ -10,8 +10,9 @@ from torchcmax.core.window import Window
 from torchcmax.slam.map import Map
 from torchcmax.slam.options import Slam
 from torchcmax.slam.record import Placement, Site, Status, Track
-from torchcmax.slam.run import Run, Seen, Source, TooShort
+from torchcmax.slam.run import Run, TooShort
 from torchcmax.slam.tracker import Belief, Sight, Step, step
+from torchcmax.slam.windows import Seen, Source
 
 __all__ = ["Placement", "Slam", "Source", "Status", "System", "TooShort", "Track"]
 _Task = tuple[Run, Site, Seen, Belief, Sight]
@@ -57,7 +58,7 @@ class System:
     def run(self, sources: Sequence[Source]) -> Iterator[Track]:
         """The windows of every recording, side by side, to the end of the longest; then all keyframes are optimized once more."""
         for run, source in zip(self.runs, sources, strict=True):
-            run.source = source
+            run.begin(source)
         while turn := [(run, seen) for run in self.runs if (seen := run.next()) is not None]:
             tasks: list[_Task] = []
             for run, seen in turn:

@@ -86,11 +86,22 @@ class Belief:
         return Belief(time, self.state.later(dt), F @ self.covariance @ F.mT + noise @ noise.mT)
 
 
+def covariance_of(sigma: tuple[float, float, float, float]) -> Tensor:
+    """[1, 12, 12], of turn, shift, angular velocity and velocity, one sigma."""
+    return torch.tensor(sigma, dtype=torch.float64).repeat_interleave(3).square().diag()[None]
+
+
 def rays_of(camera: Camera) -> Tensor:
     """A grid of rays over the sensor: [GRID * GRID, 3] float64."""
     rays = camera.rays()
     rows, columns = (torch.linspace(0, n - 1, GRID).round().long() for n in rays.shape[:2])
     return rays[rows][:, columns].reshape(-1, 3)
+
+
+def before_plane(state: State, plane: Plane) -> tuple[Motion, Plane]:
+    """The motion of a camera [1] in its own distances from a plane, and how it sees that."""
+    there = state.seen(plane)
+    return Motion(state.motion.omega, state.motion.velocity / there.distance[:, None]), there
 
 
 def speed(state: State, plane: Plane, ray: Tensor, focal: float) -> float:
