@@ -25,9 +25,10 @@ from torchcmax.core.state import State
 from torchcmax.io import DataNote, Recording
 from torchcmax.score import Similarity, score, similarity
 from torchcmax.slam.glimpse import Glimpse
+from torchcmax.slam.globe import WALL
 from torchcmax.slam.map import Map
-from torchcmax.slam.relocalize import APART, Grid, search_near
-from torchcmax.slam.run import WALL, Run, still
+from torchcmax.slam.relocalize import APART, Grid
+from torchcmax.slam.run import Run, still
 from torchcmax.slam.system import Slam, System
 from torchcmax.track import TrackOptions, load_kernels, track
 
@@ -57,6 +58,7 @@ class Half:
         for _ in tracks:
             pass
         found = tracks.trajectory()
+        assert isinstance(tracks.map, Map)
         return cls(recording, tracks.map, similarity(found.pose, recording.truth.at(found.time)), end)
 
     def truth(self, time: int) -> State:
@@ -122,7 +124,7 @@ def near(half: Half, count: int) -> dict[str, object]:
         expected = still(true.pose @ Pose(so3.exp(turn), held + shift / shift.norm() * OFF[0] / half.map.focal * away))
         motion = run.shown(window).motion
         began = time.perf_counter()
-        places = search_near(Glimpse.of(window, motion, WALL.normal, run.sensor, run.border), grid, expected)
+        places = grid.near(Glimpse.of(window, motion, WALL.normal, run.sensor, run.border), expected)
         found.append((*half.off(run, places.state[:1], int(window.middle)), time.perf_counter() - began))
     return {
         "recording": recording.name, "windows": count, "within 2 px, 1 deg": sum(px < 2 and degrees < 1 for px, degrees, _ in found),
@@ -150,6 +152,7 @@ def whole(recording: Recording, slam: Slam) -> dict[str, object]:
         pass
     seconds = time.perf_counter() - began
     path, placements = tracks.trajectory(), tracks.placements
+    assert isinstance(tracks.map, Map)
     found: dict[str, object] = {"recording": recording.name}
     for first, last in PARTS[recording.name]:
         try:

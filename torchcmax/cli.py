@@ -1,4 +1,5 @@
-"""The command line: torchcmax simulate | info | compensate | track.  Exits 0 when all went well, 1 on bad data, 2 on wrong usage."""
+"""The command line: torchcmax simulate | info | compensate | track | panorama.  Exits 0 when
+all went well, 1 on bad data, 2 on wrong usage."""
 
 from __future__ import annotations
 
@@ -23,9 +24,10 @@ from torchcmax import __version__, kernels
 from torchcmax.compensate import Compensation, compensate, load_kernels
 from torchcmax.config import USAGE_ERROR, Parser, UsageError, command, parser, usage
 from torchcmax.io import DataError, DataNote, DataWarning, OpenOptions, Recording, open, summary
+from torchcmax.panoreport import PanoramaReport
 from torchcmax.report import Report
 from torchcmax.simulator import Simulation, write
-from torchcmax.slam.system import Slam
+from torchcmax.slam.system import Panorama, Slam
 from torchcmax.track import TrackOptions, Tracks, track
 from torchcmax.track import load_kernels as load_tracking
 from torchcmax.trackreport import TrackReport
@@ -68,15 +70,22 @@ def build() -> Parser:
     )
     _add_opening(tracking)
     _add_running(tracking, images=25)
-    tracking.add_argument(
-        "--from", type=float | None, default=None, help="second of the recording's clock to begin at; default: the first event"
-    )
-    tracking.add_argument(
-        "--to", type=float | None, default=None, help="second of the recording's clock to stop before; default: the last event"
-    )
+    _add_stretch(tracking)
     tracking.add_class_arguments(TrackOptions, skip={"slam", "begin", "end"})
     tracking.add_class_arguments(Slam)
     commands.add_subcommand("track", tracking, help="follow the camera, and map the plane that it sees")
+
+    turning = command(
+        "Follow a camera that only turns, before any scene, and map what it sees on a sphere. Writes trajectory.txt (TUM: seconds, T_wc, "
+        "positions zero), windows.csv, keyframes.csv, panorama.png (equirectangular), panorama_cropped.png, panorama.h5, images/, "
+        "summary.json and TensorBoard curves to --out."
+    )
+    _add_opening(turning)
+    _add_running(turning, images=25)
+    _add_stretch(turning)
+    turning.add_class_arguments(TrackOptions, skip={"slam", "begin", "end", "distance"})
+    turning.add_class_arguments(Panorama)
+    commands.add_subcommand("panorama", turning, help="follow a camera that only turns, and map all that it sees")
     return main
 
 
@@ -94,6 +103,15 @@ def _add_running(command: Parser, images: int) -> None:
     command.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
+def _add_stretch(command: Parser) -> None:
+    command.add_argument(
+        "--from", type=float | None, default=None, help="second of the recording's clock to begin at; default: the first event"
+    )
+    command.add_argument(
+        "--to", type=float | None, default=None, help="second of the recording's clock to stop before; default: the last event"
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; the exit status is returned."""
     torch.set_num_threads(1)  # what is left to torch is too little work for two: they would spin
@@ -101,7 +119,7 @@ def main(arguments: list[str] | None = None) -> int:
     top = build()
     config = top.parsed(arguments)
     name = config.command
-    commands = {"simulate": run_simulate, "info": run_info, "compensate": run_compensate, "track": run_track}
+    commands = {"simulate": run_simulate, "info": run_info, "compensate": run_compensate, "track": run_track, "panorama": run_panorama}
     try:
         return commands[name](config[name])
     except UsageError as error:
@@ -114,7 +132,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        print(f"\ntorchcmax {name}: stopped{'; what was finished is kept' if name in ('compensate', 'track') else ''}", file=sys.stderr)
+        kept = "; what was finished is kept" if name in ("compensate", "track", "panorama") else ""
+        print(f"\ntorchcmax {name}: stopped{kept}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -234,6 +253,22 @@ def told(report: TrackReport) -> str:
     parts = [] if error["percent_of_distance"] is None else [f"{error['percent_of_distance']:.3f} % of the plane's distance"]
     parts += [f"{error['orientation_rmse_deg']:.3f} degrees", f"coverage {error['coverage']:.3f}"]
     return f"{words}\nerror: {', '.join(parts)}"
+
+
+def run_panorama(config: Namespace) -> int:
+    """torchcmax panorama"""
+    slam, out = _dataclass(Panorama, config), _folder(config.out)
+    with usage():
+        options = TrackOptions(slam, config["from"], config.to, None, config.map, config.device)
+    recording = _running(config, partial(load_tracking, slam))
+    tracks = track(recording, options)
+    text = _settings(config, slam, ("from", "to", "map", "device"))
+    with tracks.stream, PanoramaReport(out, tracks, text, config.images) as report, Progress(tracks, report, config.quiet) as bar:
+        for one in tracks:
+            report.add(one)
+            bar.update()
+    print(f"{told(report)}\ntrajectory: {out / 'trajectory.txt'}\npanorama: {out / 'panorama.png'}\ncurves: tensorboard --logdir {out}")
+    return 0
 
 
 class Progress:

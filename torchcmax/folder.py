@@ -18,7 +18,8 @@ from torchcmax.io import DataError, Recording
 SUMMARY, WINDOWS, PICTURES = "summary.json", "windows.csv", "window_*.png"
 LIVE = ".windows.live.csv"  # the table while a run goes on
 TRACKED = ("trajectory.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
-MORE = re.compile(r"map_\d+\.h5")  # maps that were not joined with the main one
+TURNED = ("trajectory.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only
+MORE = re.compile(r"(map|panorama)_\d+\.h5")  # maps that were not joined with the main one
 COLUMNS = (
     "index start_us end_us events contrast_zero contrast gain omega_x omega_y omega_z v_x v_y v_z n_x n_y n_z evaluations converged"
 ).split()  # of windows.csv, those of `track` behind them
@@ -73,7 +74,7 @@ def written(folder: Path) -> set[str]:
     try:
         summary = json.loads((folder / SUMMARY).read_text())
         names = summary.get("files", [WINDOWS]) if "torchcmax" in summary["versions"] else None
-        ours = {name for name in names or () if name in (WINDOWS, *TRACKED) or MORE.fullmatch(name)}
+        ours = {name for name in names or () if name in (WINDOWS, *TRACKED, *TURNED) or MORE.fullmatch(name)}
         return set() if names is None else {SUMMARY} | ours
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()

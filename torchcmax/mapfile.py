@@ -1,4 +1,4 @@
-"""A map in a file: HDF5, so that another run can track against it, or another program read it."""
+"""A map or a panorama in a file: HDF5, so that another run can track against it, or another program read it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.io import DataError
+from torchcmax.slam.globe import Globe
 from torchcmax.slam.map import Keyframe, Map, Texture
-from torchcmax.slam.tiles import CELL, TILE, Layers
+from torchcmax.slam.tiles import CELL, TILE, Layers, spread
 
-FORMAT, VERSION = "torchcmax map", 1
+FORMATS, VERSION = {Map: "torchcmax map", Globe: "torchcmax panorama"}, 1
 FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, UnicodeDecodeError)  # what h5py raises on broken files
 PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 STORED = 1 << 16  # events per compressed piece
 SPARE = 8 << 20  # bytes asked of the disk beside the map: HDF5 crashes the process when it finds it full
 INK = tuple(f.name for f in fields(Ink))
 LAYERS = {"votes": (TILE, TILE), "exposure": (3, TILE // CELL, TILE // CELL)}
-AGAIN = "give a map.h5 that `torchcmax track` wrote; copy it again if it may be cut off"
+AGAIN = "give a map.h5 that `torchcmax track` wrote, or a panorama.h5 of `torchcmax panorama`; copy it again if it may be cut off"
 
 
-def save_map(path: Path | str, m: Map) -> None:
-    """Writes a map with its keyframes, under another name until it is whole; `load_map` gives back the same numbers, bit for bit."""
+def save_map(path: Path | str, m: Map | Globe) -> None:
+    """Writes a map or a panorama with its keyframes, under another name until it is whole; `load_map` gives the same, bit for bit."""
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    tensors = [getattr(tile, name) for tile in m.tiles.values() for name in LAYERS]
+    tensors = [getattr(part, name) for part in (m.tiles.values() if isinstance(m, Map) else [m.layers] * 2) for name in LAYERS]
     tensors += [getattr(k.ink, name) for k in m.keyframes for name in INK]
     try:
         if shutil.disk_usage(path.parent).free < sum(t.nbytes for t in tensors) + SPARE:
@@ -54,17 +55,34 @@ def save_map(path: Path | str, m: Map) -> None:
             part.unlink(missing_ok=True)
 
 
-def _write(file: Any, m: Map) -> None:
-    file.attrs.update(format=FORMAT, version=VERSION, number=m.number, focal=m.focal, texture=json.dumps(asdict(m.texture)))
-    file["plane/normal"], file["plane/distance"] = _numbers(m.plane.normal), _numbers(m.plane.distance)
+def _write(file: Any, m: Map | Globe) -> None:
+    file.attrs.update(format=FORMATS[type(m)], version=VERSION, number=m.number, focal=m.focal, texture=json.dumps(asdict(m.texture)))
     file["border"] = _numbers(m.border)
+    if isinstance(m, Map):
+        _write_plane(file, m)
+    else:
+        _write_sphere(file, m)
+    if m.keyframes:
+        _write_keyframes(file.create_group("keyframes"), m.keyframes)
+
+
+def _write_plane(file: Any, m: Map) -> None:
+    file["plane/normal"], file["plane/distance"] = _numbers(m.plane.normal), _numbers(m.plane.distance)
     tiles = file.create_group("tiles")
     tiles["place"] = np.array(list(m.tiles), np.int64).reshape(-1, 2)  # row, column
     for name, shape in LAYERS.items() if m.tiles else ():
         layer = _numbers(torch.stack([getattr(tile, name) for tile in m.tiles.values()]))
         tiles.create_dataset(name, data=layer, chunks=(1, *shape), **PACKED)
-    if m.keyframes:
-        _write_keyframes(file.create_group("keyframes"), m.keyframes)
+
+
+def _write_sphere(file: Any, m: Globe) -> None:
+    """Equirectangular: texture [H, W] strength of the edges 0..1, for others to look at; weight [H, W] px of motion that each place was
+    seen in; the layers that they are made of."""
+    group = file.create_group("sphere")
+    group.attrs["layout"] = "equirectangular: rows from straight up to straight down, columns round; the middle looks along z of the world"
+    images = {"texture": m.strength(), "weight": spread(m.layers.most), "votes": m.layers.votes, "exposure": m.layers.exposure}
+    for name, image in images.items():
+        group.create_dataset(name, data=_numbers(image), chunks=True, **PACKED)
 
 
 def _write_keyframes(group: Any, keyframes: list[Keyframe]) -> None:
@@ -86,23 +104,26 @@ def _numbers(values: Tensor) -> np.ndarray:
     return numbers
 
 
-def load_map(path: Path | str) -> Map:
-    """The map that `save_map` wrote, on the CPU."""
-    path = Path(path)
+def load_map(path: Path | str) -> Map | Globe:
+    """The map or panorama that `save_map` wrote, on the CPU."""
+    path, kinds = Path(path), {name: kind for kind, name in FORMATS.items()}
     with _reading(path), h5py.File(path, "r") as file:
         form, version = file.attrs.get("format"), file.attrs.get("version")
-        if form != FORMAT:
+        if form not in kinds:
             raise DataError(path, "is an HDF5 file, but no map", AGAIN)
         if version != VERSION:
             raise DataError(path, f"is a map of version {version}, not {VERSION}", "read it with the torchcmax that wrote it")
-        m = Map(
-            Plane(_tensor(file["plane/normal"], 1, 3), _tensor(file["plane/distance"], 1)),
-            float(file.attrs["focal"]),
-            _tensor(file["border"], None, 3),
-            _texture(file.attrs["texture"]),
-            number=int(file.attrs["number"]),
-        )
-        m.tiles.update(_read_tiles(file["tiles"]))
+        focal, number, texture = float(file.attrs["focal"]), int(file.attrs["number"]), _texture(file.attrs["texture"])
+        m: Map | Globe
+        if kinds[form] is Globe:
+            m = Globe(focal, _tensor(file["border"], None, 3), texture, number=number)
+            height, width = m.sphere.size
+            cells = 3, height // CELL, width // CELL
+            m.layers = Layers(_tensor(file["sphere/votes"], height, width), _tensor(file["sphere/exposure"], *cells))
+        else:
+            plane = Plane(_tensor(file["plane/normal"], 1, 3), _tensor(file["plane/distance"], 1))
+            m = Map(plane, focal, _tensor(file["border"], None, 3), texture, number=number)
+            m.tiles.update(_read_tiles(file["tiles"]))
         m.keyframes.extend(_read_keyframes(file["keyframes"]) if "keyframes" in file else [])
         return m
 

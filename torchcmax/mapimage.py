@@ -74,9 +74,9 @@ def picture(m: Map, positions: Tensor | None, title: str, metres: float | None =
     grey = np.where(drawn.seen, 255 * (1 - ink), UNSEEN)
     page = Image.fromarray(np.repeat(grey.astype(np.uint8)[..., None], 3, -1))
     if positions is not None and len(positions) > 1:
-        _draw_path(page, drawn.place(before(m, positions)))
+        draw_path(page, drawn.place(before(m, positions)))
     unit = drawn.reduced / m.focal * m.plane.distance[0].item()  # plane distances per px
-    return _with_scale(page, title, unit if metres is None else unit * metres, "m" if metres is not None else "plane distances")
+    return with_scale(page, title, unit if metres is None else unit * metres, "m" if metres is not None else "plane distances")
 
 
 def before(m: Map, positions: Tensor) -> np.ndarray:
@@ -91,8 +91,8 @@ def _full(drawn: Sheet) -> float:
     return float(np.quantile(strong, BRIGHT)) if len(strong) else 1.0
 
 
-def _draw_path(page: Image.Image, xy: np.ndarray) -> None:
-    """A thin smooth line that goes from one colour to the other, within its own box."""
+def draw_path(page: Image.Image, xy: np.ndarray, jump: float = math.inf) -> None:
+    """A thin smooth line that goes from one colour to the other, within its own box; steps longer than `jump` px are left out."""
     xy = xy[np.isfinite(xy).all(1)]
     if len(xy) < 2:
         return
@@ -107,6 +107,8 @@ def _draw_path(page: Image.Image, xy: np.ndarray) -> None:
     pens = ImageDraw.Draw(mask), ImageDraw.Draw(colour)
     points = ((xy - low + 0.5) * SMOOTH).round()
     for i in range(len(points) - 1):
+        if abs(points[i + 1] - points[i]).max() > jump * SMOOTH:
+            continue
         line = [tuple(points[i]), tuple(points[i + 1])]
         shade = tuple(int(c) for c in FIRST + (LAST - FIRST) * (i / max(1, len(points) - 2)))
         pens[0].line(line, fill=255, width=round(wide * SMOOTH))
@@ -119,7 +121,7 @@ def _draw_path(page: Image.Image, xy: np.ndarray) -> None:
     page.paste(colour.resize(small, Image.Resampling.BOX), (int(low[0]), int(low[1])), mask.resize(small, Image.Resampling.BOX))
 
 
-def _with_scale(page: Image.Image, title: str, unit: float, name: str) -> np.ndarray:
+def with_scale(page: Image.Image, title: str, unit: float, name: str) -> np.ndarray:
     """The page with a line below it: a bar of a round length, and what it says."""
     text = max(13, page.width // 80)
     font = ImageFont.load_default(text)

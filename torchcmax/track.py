@@ -14,15 +14,16 @@ from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.core.window import Window
 from torchcmax.io import DataError, Recording
 from torchcmax.mapfile import load_map
-from torchcmax.slam.map import Map
-from torchcmax.slam.system import Placement, Slam, System, Track
+from torchcmax.slam.globe import Globe
+from torchcmax.slam.system import Panorama, Placement, Slam, System, Track
+from torchcmax.slam.tracker import World
 
 
 @dataclass(frozen=True)
 class TrackOptions:
     """Which part of a recording is tracked, where, and in which units its positions are told."""
 
-    slam: Slam = field(default_factory=Slam)
+    slam: Slam | Panorama = field(default_factory=Slam)
     """How it is tracked and mapped."""
     begin: float | None = None
     """Seconds of the recording's clock to start from; default: the first event."""
@@ -32,7 +33,8 @@ class TrackOptions:
     """Metres from the plane to the camera at the first event: trajectory.txt is then in metres, else in this distance. With --map: at
     the first event of the recording that the map was drawn from."""
     map: str | None = None
-    """A map.h5 of an earlier run: it is tracked against and not changed; default: the map is made on the way."""
+    """A map.h5, or of a panorama the panorama.h5, of an earlier run: it is tracked against and not changed; default: the map is made on
+    the way."""
     device: str = "cpu"
     """cpu, cuda, or cuda:1 and so on."""
 
@@ -52,7 +54,7 @@ class Tracks:
     def __init__(self, recording: Recording, options: TrackOptions) -> None:
         """Nothing is read before the first track is asked for, but for the saved map."""
         self.recording, self.options = recording, options
-        saved = None if options.map is None else [load_map(options.map)]
+        saved = None if options.map is None else [_saved(options)]
         self.system = System([recording.camera], options.slam, saved)
         self.stream = recording.stream(options.begin, options.end, options.device)
 
@@ -71,12 +73,12 @@ class Tracks:
                 raise DataError(self.recording.path, f"cannot be tracked: {error}", remedy) from error
 
     @property
-    def map(self) -> Map:
+    def map(self) -> World:
         """As it is now; ValueError before the first plane is found."""
         return self.system.maps[0]
 
     @property
-    def atlas(self) -> list[Map]:
+    def atlas(self) -> list[World]:
         """All maps that were not joined, the main one first."""
         return self.system.atlas(0)
 
@@ -118,9 +120,26 @@ def track(recording: Recording, options: TrackOptions | None = None) -> Tracks:
     return Tracks(recording, options or TrackOptions())
 
 
+def _saved(options: TrackOptions) -> World:
+    """The map to track against, of the kind that the camera wants."""
+    assert options.map is not None
+    found, turns = load_map(options.map), isinstance(options.slam, Panorama)
+    if isinstance(found, Globe) != turns:
+        kind, other = ("map of a plane", "track") if turns else ("panorama", "panorama")
+        raise DataError(options.map, f"is a {kind}", f"go on with it by `torchcmax {other} --map`")
+    return found
+
+
 def in_metres(trajectory: Trajectory, unit: float) -> Trajectory:
     """Positions times a unit."""
     return Trajectory(trajectory.time, Pose(trajectory.pose.R, trajectory.pose.t * unit))
+
+
+def _brief(slam: Slam | Panorama) -> Slam | Panorama:
+    """With a map that two windows are enough for."""
+    if isinstance(slam, Panorama):
+        return replace(slam, mapping=replace(slam.mapping, first=2))
+    return replace(slam, mapping=replace(slam.mapping, first=2))
 
 
 class _Dots:
@@ -150,9 +169,9 @@ class _Dots:
         self.done += events
 
 
-def load_kernels(slam: Slam, device: str = "cpu") -> None:
+def load_kernels(slam: Slam | Panorama, device: str = "cpu") -> None:
     """Track a few windows of dots: what is compiled, or loaded, for this device is there afterwards, and later times are of work."""
     camera = Camera.pinhole((32, 40))
     with suppress(ValueError):  # options that want more than a few dots: they are told of, if they must, on the recording
-        for _ in System([camera], replace(slam, mapping=replace(slam.mapping, first=2))).run([_Dots(camera, device)]):
+        for _ in System([camera], _brief(slam)).run([_Dots(camera, device)]):
             pass

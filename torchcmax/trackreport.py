@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,8 +28,9 @@ from torchcmax.io import DataError
 from torchcmax.io.trajectory import write_trajectory
 from torchcmax.judge import Judge, on_cpu
 from torchcmax.mapfile import save_map
-from torchcmax.mapimage import picture
+from torchcmax.mapimage import LARGEST, picture
 from torchcmax.picture import captioned, pictures, png
+from torchcmax.slam.map import Map
 from torchcmax.slam.system import Track
 from torchcmax.track import Tracks, in_metres
 from torchcmax.tracktable import KEYFRAMES, POSE, SIGNS, TABLE, Row, cells, keyframe_rows, row, set_placements, set_poses, write_table
@@ -48,17 +50,19 @@ def compensation(track: Track) -> Tensor:
 
 
 class TrackReport:
-    """The folder of one run.  What is done stays, and is said to be incomplete, when the run ends before its time.
+    """The folder of one run before a plane.  What is done stays, and is said to be incomplete, when the run ends before its time.
 
     Nothing is written, and nothing of an earlier run is replaced, before the first window is done.
     """
+
+    names: tuple[str, ...] = TRACKED
 
     def __init__(self, folder: Path, tracks: Tracks, config: str, every: int) -> None:
         """config: YAML | every: a picture of each every-th window; 0: none."""
         own = tracks.options.map
         if own is not None and Path(own).resolve().parent == folder.resolve():
             raise DataError(folder, "is where the map to track against is; it would be replaced", "give another --out")
-        check_place(folder, tracks.recording, TRACKED)
+        check_place(folder, tracks.recording, self.names)
         self.folder, self.tracks, self.config, self.every = folder, tracks, config, every
         self.canvas, self.judge = Canvas.around(tracks.recording.camera), Judge(tracks)
         self.table: list[Row] = []
@@ -154,7 +158,7 @@ class TrackReport:
         self.pictured += 1
 
     def _show_map(self, board: Board, step: int) -> None:
-        page = picture(self.tracks.map, self._positions(), self._title(), self.tracks.options.distance, SMALL)
+        page = self._page(SMALL)
         board.image("map", png(page), page.shape[:2], step)
 
     def _positions(self) -> Tensor:
@@ -221,15 +225,17 @@ class TrackReport:
         outputs: dict[str, Callable[[], None]] = {
             WINDOWS: lambda: self._write(WINDOWS, lambda name: write_table(name, TABLE, self.table)),
             "keyframes.csv": lambda: self._write("keyframes.csv", lambda name: write_table(name, KEYFRAMES, keyframe_rows(m))),
-            "map.png": lambda: self._write("map.png", lambda name: name.write_bytes(png(self._page()))),
         }
+        for name, page in self._pages().items():
+            outputs[name] = partial(self._write, name, partial(_save_page, page))
         if trajectory is not None:
             metric = in_metres(trajectory, unit)
             outputs["trajectory.txt"] = lambda: self._write("trajectory.txt", lambda name: write_trajectory(name, metric))
         if self.tracks.options.map is None:
-            outputs["map.h5"] = lambda: save_map(self.folder / "map.h5", m)
+            stem = self.names[-1].removesuffix(".h5")
+            outputs[f"{stem}.h5"] = partial(save_map, self.folder / f"{stem}.h5", m)
             for other in self.tracks.atlas[1:]:
-                name = f"map_{other.number}.h5"
+                name = f"{stem}_{other.number}.h5"
                 outputs[name] = partial(save_map, self.folder / name, other)
         return outputs
 
@@ -237,8 +243,19 @@ class TrackReport:
         with writing(self.folder / name) as temporary:
             write(temporary)
 
-    def _page(self) -> Any:
-        return picture(self.tracks.map, self._positions(), self._title(), self.tracks.options.distance)
+    def _pages(self) -> dict[str, Callable[[], np.ndarray]]:
+        """The pictures of the map."""
+        return {"map.png": self._page}
+
+    def _page(self, most: int = LARGEST) -> np.ndarray:
+        """The map, no side longer than `most` px."""
+        assert isinstance(self.tracks.map, Map)
+        return picture(self.tracks.map, self._positions(), self._title(), self.tracks.options.distance, most)
+
+    def _world(self) -> dict[str, Any]:
+        """What the summary says of the map."""
+        plane = self.tracks.map.plane if self.table else None
+        return {"plane": None if plane is None else {"normal": plane.normal[0].tolist(), "distance": plane.distance[0].item()}}
 
     def _keep_live(self) -> None:
         """The table as it was written on the way stays only where the final one could not be written."""
@@ -273,7 +290,7 @@ class TrackReport:
             "maps": len(self.tracks.atlas),
             "maps_joined": self.tracks.joins,
             "keyframes": 0 if m is None else len(m.keyframes),
-            "plane": None if m is None else {"normal": m.plane.normal[0].tolist(), "distance": m.plane.distance[0].item()},
+            **self._world(),
             "error": self.error,
             "wall_seconds": round(wall, 3),
             "read_seconds": round(read, 3),
@@ -281,10 +298,15 @@ class TrackReport:
             "compute_seconds": round(wall - read - self.spent, 3),
             "real_time_factor": round(self.factor, 4),
             "pictures": self.pictured,
-            "files": [WINDOWS, *TRACKED] if stopped == RUNNING else self.files,
+            "files": [WINDOWS, *self.names] if stopped == RUNNING else self.files,
             "config": self.config,
             "versions": versions(),
         }
+
+
+def _save_page(page: Callable[[], np.ndarray], name: Path) -> None:
+    """A picture as PNG."""
+    name.write_bytes(png(page()))
 
 
 def _scalars(line: Row, turn: list[float]) -> dict[str, float]:

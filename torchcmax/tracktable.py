@@ -15,8 +15,8 @@ from torchcmax.core import so3
 from torchcmax.core.pose import Pose
 from torchcmax.core.state import State
 from torchcmax.folder import COLUMNS, WHOLE, cell
-from torchcmax.slam.map import Map
 from torchcmax.slam.system import Placement, Track
+from torchcmax.slam.tracker import World
 
 POSE = "tx ty tz qx qy qz qw".split()
 SIGNS = "overlap strength supported doubt weakest weakest_share".split()
@@ -71,7 +71,7 @@ def cells(line: Row) -> list[str]:
     return [value if isinstance(value, str) else cell(value, name in ROUND) for name, value in line.items()]
 
 
-def keyframe_rows(m: Map) -> list[Row]:
+def keyframe_rows(m: World) -> list[Row]:
     """Lines of keyframes.csv, as the keyframes are now."""
     state = State.join([keyframe.state for keyframe in m.keyframes])
     numbers = torch.cat([pose_row(state.pose), state.motion.omega.double(), state.motion.velocity.double()], -1).tolist()

@@ -130,11 +130,11 @@ def test_moved_keyframes_are_the_same_events_elsewhere(maps, sheet):
 
 def test_a_map_fits_where_it_belongs(maps, sensor):
     home, local = maps
-    keyframes = fitting(local, TRUE, home, sensor)
+    keyframes = fitting(local, TRUE, home, home, sensor)
     assert keyframes is not None
     for one, other in zip(keyframes, moved(local, TRUE), strict=True):
         assert torch.equal(one.state.pose.t, other.state.pose.t)
-    scores = [agreement(k, home, sensor) for k in keyframes]
+    scores = [agreement(k, home, home, sensor) for k in keyframes]
     assert sorted(scores)[len(scores) // 2] > 1.5 * FITS
 
 
@@ -142,7 +142,7 @@ def test_a_keyframe_agrees_less_where_it_is_not(maps, sensor):
     home, local = maps
     keyframe = moved(local, TRUE)[1]
     beside = keyframe.at(keyframe.state.moved(torch.tensor([[0.0] * 3 + [0.05] + [0.0] * 8], dtype=torch.float64)))
-    assert 0 <= agreement(beside, home, sensor) < 0.6 * agreement(keyframe, home, sensor)
+    assert 0 <= agreement(beside, home, home, sensor) < 0.6 * agreement(keyframe, home, home, sensor)
 
 
 @pytest.mark.parametrize(
@@ -159,14 +159,14 @@ def test_a_keyframe_agrees_less_where_it_is_not(maps, sensor):
 def test_a_map_does_not_fit_where_it_does_not_belong(maps, sensor, wrong):
     home, local = maps
     pose = wrong.pose(Pose(TRUE.R, TRUE.t))
-    assert fitting(local, Similarity(pose.R, pose.t, TRUE.scale * wrong.scale), home, sensor) is None
+    assert fitting(local, Similarity(pose.R, pose.t, TRUE.scale * wrong.scale), home, home, sensor) is None
 
 
 def test_a_map_of_what_the_other_does_not_know_does_not_fit(maps, sensor):
     home, local = maps
     away = replace(TRUE, t=TRUE.t + torch.tensor([[6.0, 0.0, 0.0]], dtype=torch.float64))
-    assert agreement(moved(local, away)[0], home, sensor) < 0
-    assert fitting(local, away, home, sensor) is None
+    assert agreement(moved(local, away)[0], home, home, sensor) < 0
+    assert fitting(local, away, home, home, sensor) is None
 
 
 def test_keyframes_that_see_what_is_not_known_do_not_speak(maps, sensor):
@@ -176,7 +176,7 @@ def test_keyframes_that_see_what_is_not_known_do_not_speak(maps, sensor):
     away = state_of(shift=(6.0, 0.0, 0.0))
     far = [k.at(replace(k.state, pose=Pose(k.state.pose.R, k.state.pose.t + away.pose.t))) for k in local.keyframes]
     both = replace(local, keyframes=few.keyframes + far)
-    keyframes = fitting(both, TRUE, home, sensor)
+    keyframes = fitting(both, TRUE, home, home, sensor)
     assert keyframes is not None
     assert len(keyframes) == len(both.keyframes)
-    assert fitting(replace(local, keyframes=far), TRUE, home, sensor) is None
+    assert fitting(replace(local, keyframes=far), TRUE, home, home, sensor) is None

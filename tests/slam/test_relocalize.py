@@ -32,8 +32,6 @@ from torchcmax.slam.relocalize import (
     fast,
     found_at,
     judged,
-    search_far,
-    search_near,
     searched,
 )  # fmt: skip
 from torchcmax.slam.tracker import before_plane
@@ -392,7 +390,7 @@ def test_a_camera_is_found_near(sheet, home, glimpse, sign, compiled, monkeypatc
     off[0, 3] = -sign * 15 / sheet.focal * away
     expected = sheet.states[WHICH].moved(off)
     assert error(sheet, expected) > 14
-    found = search_near(glimpse, home, expected)
+    found = home.near(glimpse, expected)
     assert error(sheet, found.state[:1]) < 1
     assert float(found.score[0]) > 0.75
     assert found.clear > 1.5
@@ -403,11 +401,11 @@ def test_a_camera_is_found_near(sheet, home, glimpse, sign, compiled, monkeypatc
 
 @pytest.mark.parametrize("i", [WHICH, 21])
 def test_a_camera_is_found_in_the_whole_map(sheet, home, i):
-    found = search_far(glimpse_of(sheet, i, home), home)
+    found = home.far(glimpse_of(sheet, i, home))
     assert error(sheet, found.state[:1], i) < 1
     assert float(found.score[0]) > QUICK.accept
     assert found.clear > 1.5
-    again = search_far(glimpse_of(sheet, i, home), home)
+    again = home.far(glimpse_of(sheet, i, home))
     assert torch.equal(found.state.pose.t, again.state.pose.t)
     assert torch.equal(found.score, again.score)
 
@@ -448,10 +446,10 @@ def test_a_camera_is_found_in_any_world(request, size):
     m = drawn(scene, range(0, len(scene.windows), 2))
     grid = Grid(m, Relocalizing())
     glimpse = glimpse_of(scene, WHICH, m)
-    assert error(scene, search_far(glimpse, grid).state[:1]) < 1
+    assert error(scene, grid.far(glimpse).state[:1]) < 1
     off = scene.states[WHICH].moved(torch.tensor([[0.03, -0.03, 0.04, 0.1, -0.05, 0.05, *[0.0] * 6]], dtype=torch.float64))
     assert error(scene, off) > 10
-    assert error(scene, search_near(glimpse, grid, off).state[:1]) < 1
+    assert error(scene, grid.near(glimpse, off).state[:1]) < 1
 
 
 def test_a_window_of_noise_is_found_nowhere(sheet, home):
@@ -460,8 +458,8 @@ def test_a_window_of_noise_is_found_nowhere(sheet, home):
     ray = flat[torch.randint(len(flat), (window.ray.shape[1],), generator=random)][None]
     motion, there = before_plane(sheet.states[WHICH], sheet.plane)
     glimpse = Glimpse.of(replace(window, ray=ray), motion, there.normal, Canvas.around(sheet.camera, 0.0), home.border)
-    assert float(search_far(glimpse, home).score[0]) < 0.5 * QUICK.accept
-    assert float(search_near(glimpse, home, sheet.states[WHICH]).score[0]) < 0.5 * QUICK.accept
+    assert float(home.far(glimpse).score[0]) < 0.5 * QUICK.accept
+    assert float(home.near(glimpse, sheet.states[WHICH]).score[0]) < 0.5 * QUICK.accept
 
 
 def test_a_search_begins_with_the_motion_in_the_distances_of_each_place(sheet, home, glimpse, monkeypatch):

@@ -12,8 +12,7 @@ from scenes import drawn, map_of, pixels, state_of, wall
 from torchcmax.core import so3
 from torchcmax.core.camera import Canvas
 from torchcmax.core.state import State
-from torchcmax.slam import seek
-from torchcmax.slam.relocalize import Found, Relocalizing
+from torchcmax.slam.relocalize import Found, Grid, Relocalizing
 from torchcmax.slam.seek import MOST, SAME, SIGMA, Candidate, Searching, Seeker
 from torchcmax.slam.tiles import TILE
 from torchcmax.slam.tracker import Belief, Tracking, before_plane, covariance_of, rays_of, speed
@@ -35,7 +34,7 @@ def seeker_on(sheet):
 
     def make(m, how=QUICK, certain=1.0):
         canvas, sensor = Canvas.around(sheet.camera), Canvas.around(sheet.camera, 0.0)
-        made.append(Seeker(m, canvas, sensor, rays_of(sheet.camera), Searching(how, Tracking(), "planar", certain)))
+        made.append(Seeker(m, Grid(m, how), canvas, sensor, rays_of(sheet.camera), Searching(how, Tracking(), "planar", certain)))
         return made[-1]
 
     yield make
@@ -219,7 +218,7 @@ def nowhere(*_):
 
 
 def test_searches_become_rarer_while_nothing_is_found(sheet, home, seeker_on, monkeypatch):
-    monkeypatch.setattr(seek, "search_far", nowhere)
+    monkeypatch.setattr(Grid, "far", nowhere)
     seeker, begun = seeker_on(home, replace(QUICK, wait=0.1, again=0.5)), []
     window, motion, normal = shown(sheet, FIRST)
     for ms in range(0, 2500, 10):
@@ -230,7 +229,7 @@ def test_searches_become_rarer_while_nothing_is_found(sheet, home, seeker_on, mo
 
 
 def test_a_result_counts_after_the_wait_and_not_before(sheet, home, seeker_on, monkeypatch):
-    monkeypatch.setattr(seek, "search_far", nowhere)
+    monkeypatch.setattr(Grid, "far", nowhere)
     seeker = seeker_on(home, replace(QUICK, wait=0.1))
     window, motion, normal = shown(sheet, FIRST)
     flying = []
@@ -241,8 +240,8 @@ def test_a_result_counts_after_the_wait_and_not_before(sheet, home, seeker_on, m
 
 
 def test_windows_do_not_wait_for_a_search_where_runs_need_not_be_the_same(sheet, home, seeker_on, monkeypatch):
-    go, search = Event(), seek.search_far
-    monkeypatch.setattr(seek, "search_far", lambda glimpse, grid: search(glimpse, grid) if go.wait(30) else None)
+    go, search = Event(), Grid.far
+    monkeypatch.setattr(Grid, "far", lambda grid, glimpse: search(grid, glimpse) if go.wait(30) else None)
     seeker = seeker_on(home, replace(QUICK, steady=False))
     began = time.monotonic()
     assert offered(seeker, sheet, range(FIRST, FIRST + 10)) is None

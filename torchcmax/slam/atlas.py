@@ -11,9 +11,10 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
-from torchcmax.slam.map import Keyframe, Map
-from torchcmax.slam.relocalize import Glimpse, Grid, judged
-from torchcmax.slam.tracker import before_plane
+from torchcmax.slam.glimpse import Glimpse
+from torchcmax.slam.map import Keyframe
+from torchcmax.slam.seek import Searchable
+from torchcmax.slam.tracker import World, before_plane
 
 FITS = 0.4  # score that the keyframes of the one map have in the other, where it knows their view, in the median
 
@@ -45,20 +46,20 @@ class Similarity:
         return State(self.pose(state.pose), Motion(state.motion.omega, state.motion.velocity * self.scale[:, None]))
 
 
-def moved(m: Map, similarity: Similarity) -> list[Keyframe]:
+def moved(m: World, similarity: Similarity) -> list[Keyframe]:
     """The keyframes of a map in the other world."""
     return [keyframe.at(similarity.state(keyframe.state)) for keyframe in m.keyframes]
 
 
-def fitting(m: Map, similarity: Similarity, home: Grid, sensor: Canvas) -> list[Keyframe] | None:
+def fitting(m: World, similarity: Similarity, home: World, grid: Searchable, sensor: Canvas) -> list[Keyframe] | None:
     """The keyframes of a map in the world of another, if those that see what it knows fit it; else None."""
     keyframes = moved(m, similarity)
-    scores = [score for k in keyframes if (score := agreement(k, home, sensor)) >= 0]
+    scores = [score for k in keyframes if (score := agreement(k, home, grid, sensor)) >= 0]
     return keyframes if scores and median(scores) >= FITS else None
 
 
-def agreement(keyframe: Keyframe, home: Grid, sensor: Canvas) -> float:
+def agreement(keyframe: Keyframe, home: World, grid: Searchable, sensor: Canvas) -> float:
     """The score of a keyframe in a map, below zero where the map hardly knows what it sees."""
     motion, there = before_plane(keyframe.state, home.plane)
     glimpse = Glimpse.drawn(keyframe.ink, keyframe.seconds, motion, there.normal, sensor, home.border)
-    return float(judged(glimpse, home, keyframe.state)[0][0])
+    return grid.judge(glimpse, keyframe.state)

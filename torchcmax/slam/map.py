@@ -15,6 +15,7 @@ from torchcmax.core.contrast import blur
 from torchcmax.core.draw import Ink, draw
 from torchcmax.core.match import Chart
 from torchcmax.core.plane import Plane
+from torchcmax.core.pose import Pose
 from torchcmax.core.state import State
 from torchcmax.slam.tiles import CELL, TILE, Box, Layers, apart, at, flat, joined, places, spread
 
@@ -105,6 +106,10 @@ class Map:
         """The least and the largest x and y of its rays."""
         return self.border[:, :2].amin(0).tolist(), self.border[:, :2].amax(0).tolist()
 
+    def toward(self, pose: Pose) -> Map:
+        """The part of it that a camera [1] sees, on one plane: all."""
+        return self
+
     def warp(self, state: State, seconds: Tensor) -> Tensor:
         """How the events of a window [1] come onto the map: H_k [K, 3, 3]."""
         return state.homography(self.plane, seconds, self.view)[0]
@@ -159,13 +164,18 @@ class Map:
 
     def typical(self) -> float:
         """The rate that an event meets on average: sum r^2 / sum r over the map."""
+        first, second = self.sums()
+        return second / first if first > 0 else 0.0
+
+    def sums(self) -> tuple[float, float]:
+        """Of the rates of all pixels, and of their squares."""
         stale = [name for name in self.tiles if name not in self._sums]
         if stale:
             votes, exposure = (torch.stack([getattr(self.tiles[name], layer) for name in stale]) for layer in ("votes", "exposure"))
             rate = self.rate(Layers(votes, exposure)).flatten(1)
             self._sums |= dict(zip(stale, zip(rate.sum(1).tolist(), rate.square().sum(1).tolist(), strict=True), strict=True))
         first, second = (sum(sums[i] for sums in self._sums.values()) for i in (0, 1))
-        return second / first if first > 0 else 0.0
+        return first, second
 
     def draw(self, keyframes: Sequence[Keyframe]) -> None:
         """Add windows, and tiles for them where there are none."""

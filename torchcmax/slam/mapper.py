@@ -19,7 +19,7 @@ from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import SIZE, State
 from torchcmax.core.window import Window
-from torchcmax.slam.map import Area, Map
+from torchcmax.slam.map import Area, Keyframe, Map
 from torchcmax.slam.tracker import SOME
 
 ROUGH = 10.0  # tolerances that are enough to tell the twin plane
@@ -30,13 +30,13 @@ Free = tuple[bool, bool]
 
 
 @dataclass(frozen=True)
-class Mapping:
-    """How the map is made."""
+class Keyframing:
+    """How a map is begun, drawn, and optimized."""
 
     first: int = 16
-    """Windows that the first plane is estimated from."""
+    """Windows that the first map is estimated from."""
     joint: Joint = field(default_factory=Joint)
-    """How the first plane is estimated from them."""
+    """How it is estimated from them."""
     thinned: int = 6000
     """Events of each of them that are used at most."""
     settle: int = 8
@@ -51,18 +51,29 @@ class Mapping:
     """New keyframes after which the joint optimization waits for the end."""
     final: int = 1
     """Rounds of joint optimization of all keyframes at the end."""
+
+    def __post_init__(self) -> None:
+        least = {"first": 1, "thinned": 2, "every": 1, "last": 1, "settle": 0, "until": 0, "final": 0}
+        wrong = [f"{name} of at least {n}, got {getattr(self, name)}" for name, n in least.items() if getattr(self, name) < n]
+        wrong += [] if 0 <= self.overlap <= 1 else [f"an overlap of 0 to 1, got {self.overlap}"]
+        if wrong:
+            raise ValueError(f"mapping wants {wrong[0]}")
+
+
+@dataclass(frozen=True)
+class Mapping(Keyframing):
+    """How the map of a plane is made."""
+
     tilt: float = 10.0
     """degrees: what the first plane may be off, one sigma."""
     doubt: float = 10.0
     """How many times less certain the plane is than its events say, as what biases it is the same in all of them."""
 
     def __post_init__(self) -> None:
-        least = {"first": 1, "thinned": 2, "every": 1, "last": 1, "settle": 0, "until": 0, "final": 0}
-        wrong = [f"{name} of at least {n}, got {getattr(self, name)}" for name, n in least.items() if getattr(self, name) < n]
-        wrong += [] if 0 <= self.overlap <= 1 else [f"an overlap of 0 to 1, got {self.overlap}"]
-        wrong += [f"{name} above 0, got {getattr(self, name)}" for name in ("tilt", "doubt") if not getattr(self, name) > 0]
-        if wrong:
-            raise ValueError(f"mapping wants {wrong[0]}")
+        super().__post_init__()
+        for name in ("tilt", "doubt"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"mapping wants {name} above 0, got {getattr(self, name)}")
 
 
 def thinned(ink: Ink, most: int) -> Ink:
@@ -71,7 +82,12 @@ def thinned(ink: Ink, most: int) -> Ink:
 
 
 def first_plane(
-    windows: Sequence[Window], motions: Sequence[Motion], focal: float, how: Mapping, start: Plane | None = None, free: Free = (True, True)
+    windows: Sequence[Window],
+    motions: Sequence[Motion],
+    focal: float,
+    how: Keyframing,
+    start: Plane | None = None,
+    free: Free = (True, True),
 ) -> Solved:
     """Consecutive windows before one plane, from their own motions [1] before a wall: all motions and the plane together.
 
@@ -162,10 +178,12 @@ def explained(m: Map, number: int, matching: Matching, typical: float) -> float:
     typical: the rate of an edge, the same for maps that are to be compared
     """
     found = among_others(m, number, typical)
-    if found is None:
-        return 0.0
-    area, H_k = found
-    few = m.trusted(m.keyframes[number].ink.thinned(matching.every), H_k, area)
+    return 0.0 if found is None else met(m, m.keyframes[number], *found, matching)
+
+
+def met(m: Map, keyframe: Keyframe, area: Area, H_k: Tensor, matching: Matching) -> float:
+    """The mean strength that a keyframe's events meet in an area of a map, by its warp H_k [K, 3, 3], where that is known."""
+    few = m.trusted(keyframe.ink.thinned(matching.every), H_k, area)
     strength = lookup(area.charts[0].texture, m.pixels(few, H_k)[None] - area.charts[0].corner.to(few.x))[0][0]
     return float((strength * few.weight[0]).sum() / few.weight.sum().clamp_min(1))
 
@@ -205,9 +223,11 @@ def _placed(m: Map, number: int, matching: Matching, basis: Tensor | None) -> _P
 def before_others(m: Map, number: int, matching: Matching, basis: Tensor | None = None) -> Task | None:
     """A keyframe before the map of all others; None where nothing of them is in its view."""
     found = among_others(m, number)
-    if found is None:
-        return None
-    (area, H_k), keyframe = found, m.keyframes[number]
+    return None if found is None else before(m, m.keyframes[number], *found, matching, basis)
+
+
+def before(m: Map, keyframe: Keyframe, area: Area, H_k: Tensor, matching: Matching, basis: Tensor | None = None) -> Task | None:
+    """A keyframe before an area of a map, by its warp H_k [K, 3, 3]; None where nothing of it is in its view."""
     few = m.trusted(keyframe.ink.thinned(matching.every), H_k, area)
     if not few.weight.any():
         return None

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcmax.core.plane import Plane
 from torchcmax.core.state import State
 from torchcmax.core.window import Window
-from torchcmax.slam.map import Map
+from torchcmax.slam.tracker import World
 
 Status = Literal["start", "ok", "weak", "still", "lost"]
 FEW, UNSURE, NOISE, ALONG, GAP = "few edges met", "unsure where", "only noise", "looks along the plane", "no events for long"  # reasons
@@ -60,7 +60,7 @@ class Track:
     converged: bool
     keyframe: int
     drawn: bool
-    map: Map
+    map: World
 
     @property
     def overlap(self) -> float:
@@ -77,7 +77,7 @@ class Track:
 class Site:
     """A map on its way: the plane it began with, what is usual there, and keyframes since the last joint optimization and in all."""
 
-    map: Map
+    map: World
     start: Plane
     usual: deque[float]
     fresh: int = 0

@@ -39,33 +39,17 @@ FLAT = 1e-5  # variance below which there is nothing to correlate
 
 
 @dataclass(frozen=True)
-class Relocalizing:
-    """How a camera is searched for in a map."""
+class Seeking:
+    """When a camera is searched for, and what is believed."""
 
     near: bool = True
     """A window that finds too little is looked for around where it was expected."""
     far: bool = True
     """A lost camera is looked for in the whole map."""
-    cell: int = 12
-    """px of the map, each way, that are one in the search of the whole map."""
-    turn: float = 15.0
-    """degrees from one direction of the image to the next."""
-    scale: float = 1.25
-    """From one height over the plane to the next; from below the lowest keyframe to above the highest."""
-    tilts: tuple[tuple[float, int], ...] = ((0.0, 1), (18.0, 6))
-    """degrees from the plane's normal, each in so many directions."""
     known: float = 0.4
     """Share of the view that the map must know."""
-    candidates: int = 120
-    """Places that are looked at more closely."""
-    rounds: tuple[tuple[float, int, int], ...] = ((12.0, 800, 120), (6.0, 1500, 60), (3.0, 3000, 40), (1.5, 6000, 12), (0.5, 20000, 6))
-    """Of that closer look: blur of the map px, events, places that go on to the next."""
-    loose: tuple[float, float] = (6.0, 3.0)
-    """px that pose and motion go in a round, one sigma."""
     around: tuple[float, float] = (30.0, 10.0)
     """px and degrees around the expected place within which a camera is near."""
-    starts: int = 48
-    """Places around it that are tried."""
     accept: float = 0.6
     """Least score of a place: correlation times the root of the share that the map knows."""
     ratio: float = 1.1
@@ -81,14 +65,43 @@ class Relocalizing:
     """s at most from one search to the next; they begin at `wait` and double."""
 
     def __post_init__(self) -> None:
+        above = {"wait": self.wait, "ratio": self.ratio, "around": min(self.around)}
+        wrong = [f"{name} above 0, got {value}" for name, value in above.items() if not value > 0]
+        wrong += [f"{name} of 0 to 1, got {getattr(self, name)}" for name in ("known", "accept") if not 0 <= getattr(self, name) <= 1]
+        wrong += [] if min(self.confirm) >= 0 and self.again >= self.wait else ["confirm of at least 0, and again not below wait"]
+        if wrong:
+            raise ValueError(f"relocalizing wants {wrong[0]}")
+
+
+@dataclass(frozen=True)
+class Relocalizing(Seeking):
+    """How a camera is searched for in the map of a plane."""
+
+    cell: int = 12
+    """px of the map, each way, that are one in the search of the whole map."""
+    turn: float = 15.0
+    """degrees from one direction of the image to the next."""
+    scale: float = 1.25
+    """From one height over the plane to the next; from below the lowest keyframe to above the highest."""
+    tilts: tuple[tuple[float, int], ...] = ((0.0, 1), (18.0, 6))
+    """degrees from the plane's normal, each in so many directions."""
+    candidates: int = 120
+    """Places that are looked at more closely."""
+    rounds: tuple[tuple[float, int, int], ...] = ((12.0, 800, 120), (6.0, 1500, 60), (3.0, 3000, 40), (1.5, 6000, 12), (0.5, 20000, 6))
+    """Of that closer look: blur of the map px, events, places that go on to the next."""
+    loose: tuple[float, float] = (6.0, 3.0)
+    """px that pose and motion go in a round, one sigma."""
+    starts: int = 48
+    """Places around the expected one that are tried."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         counts = {"cell": self.cell, "candidates": self.candidates, "starts": self.starts}
-        above = {"turn": self.turn, "wait": self.wait, "ratio": self.ratio, "loose": min(self.loose), "around": min(self.around)}
+        above = {"turn": self.turn, "loose": min(self.loose)}
         wrong = [f"{name} of at least 1, got {value}" for name, value in counts.items() if not value >= 1]
         wrong += [f"{name} above 0, got {value}" for name, value in above.items() if not value > 0]
-        wrong += [f"{name} of 0 to 1, got {getattr(self, name)}" for name in ("known", "accept") if not 0 <= getattr(self, name) <= 1]
         wrong += [] if self.turn <= 360 and self.scale > 1 else [f"a turn of up to 360 and a scale above 1, got {self.turn}, {self.scale}"]
         wrong += [] if self.tilts and self.rounds else ["tilts and rounds, got none"]
-        wrong += [] if min(self.confirm) >= 0 and self.again >= self.wait else ["confirm of at least 0, and again not below wait"]
         if wrong:
             raise ValueError(f"relocalizing wants {wrong[0]}")
 
@@ -112,6 +125,26 @@ class Grid:
             corner = torch.tensor([self.box.corner], dtype=torch.float64)
             self._charts[sigma] = Chart(blur(self.texture[None], sigma), corner, self.view, self.focal)
         return self._charts[sigma]
+
+    def far(self, glimpse: Glimpse) -> Found:
+        """Where in the whole map a window fits."""
+        return found_at(glimpse, self, searched(glimpse, self), self.how.rounds)
+
+    def near(self, glimpse: Glimpse, expected: State) -> Found:
+        """Where around the expected state [1] a window fits."""
+        return self.at(glimpse, around(self, expected))
+
+    def at(self, glimpse: Glimpse, pose: Pose) -> Found:
+        """What becomes of poses [K]."""
+        return found_at(glimpse, self, pose, self.how.rounds)
+
+    def judge(self, glimpse: Glimpse, state: State) -> float:
+        """The score of a state [1]."""
+        return float(judged(glimpse, self, state)[0][0])
+
+    def seen(self, state: State) -> Tensor:
+        """px on the map of points of the sensor's edge, seen from states [K]: [K, M, 2]."""
+        return seen_at(self, state)
 
     @cached_property
     def coarse(self) -> Tensor:
@@ -296,13 +329,3 @@ def distinct(grid: Grid, state: State, score: Tensor, keep: int) -> Tensor:
             kept.append(i)
             alive &= other[i]
     return order[torch.tensor(kept)]
-
-
-def search_far(glimpse: Glimpse, grid: Grid) -> Found:
-    """Where in the whole map a window fits."""
-    return found_at(glimpse, grid, searched(glimpse, grid), grid.how.rounds)
-
-
-def search_near(glimpse: Glimpse, grid: Grid, expected: State) -> Found:
-    """Where around the expected state [1] a window fits."""
-    return found_at(glimpse, grid, around(grid, expected), grid.how.rounds)

@@ -19,14 +19,15 @@ from torchcmax.core.state import State
 from torchcmax.core.window import Window
 from torchcmax.slam.atlas import Similarity, fitting
 from torchcmax.slam.glimpse import Glimpse
+from torchcmax.slam.globe import WALL
 from torchcmax.slam.map import Keyframe, Map
 from torchcmax.slam.mapper import first_plane, rebased, settled
-from torchcmax.slam.options import Slam
+from torchcmax.slam.options import Panorama, Slam
 from torchcmax.slam.record import ALONG, FEW, GAP, NOISE, UNSURE, Placement, Signs, Site, Status, Track
-from torchcmax.slam.relocalize import Grid, search_near
-from torchcmax.slam.seek import Searching, Seeker
+from torchcmax.slam.relocalize import Grid
+from torchcmax.slam.seek import Searchable, Searching, Seeker
 from torchcmax.slam.sense import decided, name_of
-from torchcmax.slam.tracker import Belief, Front, Sight, Step, basis_of, before_plane, covariance_of, doubt, front, rays_of, step
+from torchcmax.slam.tracker import Belief, Front, Sight, Step, World, basis_of, before_plane, covariance_of, doubt, front, rays_of, step
 from torchcmax.slam.windows import Seen, Source, Windows
 
 FIRST_SIGMA = 0.005, 0.005, 0.2, 0.2  # of the last start window: turn, shift, angular velocity, velocity
@@ -56,7 +57,7 @@ class Run:
 
     windows: Windows  # where it is begun
 
-    def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam, given: Map | None) -> None:
+    def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam | Panorama, given: World | None) -> None:
         self.number, self.canvas, self.options, self.given = number, canvas, options, given
         self.camera, self.sensor = camera, Canvas.around(camera, 0.0)
         rays = camera.rays()
@@ -72,7 +73,7 @@ class Run:
         self.early: list[tuple[Seen, Front | None]] = []  # windows before there is anything to tell of them
         self.motion: Motion | None = None  # before a wall, while there is no map
         self.seeker: Seeker | None = None
-        self.grid: tuple[Map, int, Grid] | None = None
+        self.grid: tuple[World, int, Searchable] | None = None
         self.weak_since: int | None = None  # µs, of windows that met few edges; and of those of which it was unsure where
         self.unsure_since: int | None = None
         self.index = self.losses = self.recoveries = self.joins = 0
@@ -140,7 +141,7 @@ class Run:
         free = (model != "translation", model != "rotation")
         solved = rebased(first_plane(windows, motions, self.canvas.focal, how, free=free).frames)
         number = 1 + max((site.map.number for site in self.sites), default=-1)
-        m = Map(solved.plane, self.canvas.focal, self.border, self.options.texture, number=number)
+        m = self._blank(solved.plane, number)
         m.draw([keyframe_of(window, solved.state[i : i + 1]) for i, window in enumerate(windows)])
         self.site = self._site(m)
         self.sites.append(self.site)
@@ -171,7 +172,7 @@ class Run:
     def _lost(self, seen: Seen, alone: Front | None, reason: str) -> Track:
         """A window of a camera of which nothing is known: it stays where it was."""
         state = still(rest() if self.belief is None else self.belief.state.pose)
-        site = self.last or self._site(Map(WALL, self.canvas.focal, self.border, self.options.texture))
+        site = self.last or self._site(self._blank(WALL))
         return self._track(seen, Placement(seen.time, "lost", site), Signs(seen.supported, 0.0, 0.0), reason, alone, state=state)
 
     def lose(self) -> None:
@@ -192,7 +193,7 @@ class Run:
         if self.seeker is None:
             how = self.options
             searching = Searching(how.relocalizing, how.tracking, how.model, how.sensing.certain)
-            self.seeker = Seeker(self.sites[0].map, self.canvas, self.sensor, self.rays, searching)
+            self.seeker = Seeker(self.sites[0].map, self._searchable(self.sites[0].map), self.canvas, self.sensor, self.rays, searching)
             if self.given is not None and self.index == 0:
                 self.seeker.guess(window, motion, normal)
         found = self.seeker.offer(window, motion, normal)
@@ -237,7 +238,7 @@ class Run:
         similarity = Similarity.between(self._belief.state, local.map.plane, now.state, home.map.plane)
         self.belief = now
         there = [(p, similarity.state(p.there())) for p in self.placements if p.site is local]
-        keyframes = fitting(local.map, similarity, self._grid(home), self.sensor)
+        keyframes = fitting(local.map, similarity, home.map, self._grid(home), self.sensor)
         if keyframes is None:
             return
         if self.given is None:
@@ -291,13 +292,13 @@ class Run:
         if sight is None or status == "lost":
             yield from self.blind(seen, ALONG if sight is None else reason)
             return
-        overlap = site.map.overlap(sight.H_k, self.rays, sight.area)
+        overlap = sight.map.overlap(sight.H_k, self.rays, sight.area)
         drawn = status == "ok" and overlap < self.options.mapping.overlap and self.given is None
         if drawn:
             site.map.draw([keyframe_of(seen.window, self._belief.state)])
             self._optimize(site)
         share, directions = decided(found.information[row], found.prior[row])
-        signs = Signs(seen.supported, overlap, strength, unsure, name_of(directions[:, 0]), float(share[0]))
+        signs = Signs(seen.supported, overlap, strength, unsure, name_of(directions[:, 0], found.free), float(share[0]))
         evaluations = int(found.match.evaluations[row])
         yield self._track(seen, self._placed(site, seen, status), signs, reason, found.front, row, evaluations, drawn)
         if status == "ok":
@@ -325,15 +326,15 @@ class Run:
             return None
         shown = State(before.state.pose, Motion(found.front.motion.omega[row : row + 1], found.front.motion.velocity[row : row + 1]))
         motion, there = before_plane(shown, site.map.plane)
-        places = search_near(Glimpse.of(window, motion, there.normal, self.sensor, self.border), self._grid(site), before.state)
+        places = self._grid(site).near(Glimpse.of(window, motion, there.normal, self.sensor, self.border), before.state)
         sure = float(places.score[0]) >= how.accept and places.clear >= how.ratio
         return Belief(before.time, places.state[:1], covariance_of(FOUND_SIGMA)) if sure else None
 
-    def _grid(self, site: Site) -> Grid:
+    def _grid(self, site: Site) -> Searchable:
         """The map made ready for searching, kept until it changes."""
         kept = self.grid
         if kept is None or kept[0] is not site.map or kept[1] != len(site.map.keyframes):
-            self.grid = kept = site.map, len(site.map.keyframes), Grid(site.map, self.options.relocalizing)
+            self.grid = kept = site.map, len(site.map.keyframes), self._searchable(site.map)
         return kept[2]
 
     def _optimize(self, site: Site) -> None:
@@ -347,11 +348,29 @@ class Run:
     def _settle(self, site: Site, last: int | None, moving: bool = False) -> None:
         """One round; a camera that is moving there goes with the newest keyframe."""
         before = site.map.keyframes[-1].state.pose
-        basis = basis_of(self.options.model, "full")
-        site.map = settled(site.map, site.start, self.options.mapping, self.options.tracking.matching, last, basis).map
+        site.map = self._round(site, last)
         if moving:
             pose = site.map.keyframes[-1].state.pose @ before.inverse() @ self._belief.state.pose
             self.belief = replace(self._belief, state=replace(self._belief.state, pose=pose))
+
+    # what is of a plane, and not of a sphere
+
+    def _blank(self, plane: Plane, number: int = 0) -> World:
+        """A map without anything."""
+        return Map(plane, self.canvas.focal, self.border, self.options.texture, number=number)
+
+    def _round(self, site: Site, last: int | None) -> World:
+        """The map after a round of joint optimization of the last keyframes; None: of all."""
+        assert isinstance(site.map, Map)
+        assert isinstance(self.options, Slam)
+        how, basis = self.options, basis_of(self.options.model, "full")
+        return settled(site.map, site.start, how.mapping, how.tracking.matching, last, basis).map
+
+    def _searchable(self, m: World) -> Searchable:
+        """The map made ready for searching."""
+        assert isinstance(m, Map)
+        assert isinstance(self.options, Slam)
+        return Grid(m, self.options.relocalizing)
 
     # the end
 
@@ -374,7 +393,7 @@ class Run:
                     self._settle(site, None)
 
     @property
-    def map(self) -> Map:
+    def map(self) -> World:
         """The main one: the first, and at the end the one that most windows belong to."""
         if not self.sites:
             raise ValueError("there is no map before the first plane is found")
@@ -389,7 +408,7 @@ class Run:
 
     # telling
 
-    def _site(self, m: Map) -> Site:
+    def _site(self, m: World) -> Site:
         return Site(m, m.plane, deque(maxlen=self.options.sensing.recent))
 
     def _placed(self, site: Site, seen: Seen, status: Status) -> Placement:
@@ -410,16 +429,13 @@ class Run:
         if alone is not None:
             zero, contrast, converged = float(alone.zero[row]), float(alone.contrast[row]), bool(alone.converged[row])
             evaluations += int(alone.evaluations[row])
-        normal = m.plane.seen_from(state.pose).normal
+        normal = m.plane.seen_from(state.pose).normal if isinstance(m, Map) else torch.full_like(state.pose.t, torch.nan)
         track = Track(
             self.number, self.index, seen.window, seen.time, state, normal, zero, contrast, signs, placement.status,
             GAP if seen.gap and placement.status == "lost" else reason, evaluations, converged, placement.keyframe, drawn, m,
         )  # fmt: skip
         self.index += 1
         return track
-
-
-WALL = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))  # at distance one
 
 
 def rest() -> Pose:
@@ -433,7 +449,7 @@ def still(pose: Pose) -> State:
     return State(pose, Motion(zero, zero))
 
 
-def nearest(m: Map, pose: Pose) -> int:
+def nearest(m: World, pose: Pose) -> int:
     """The keyframe whose camera is nearest to one [1], in plane distances and radians."""
     state = State.join([keyframe.state for keyframe in m.keyframes])
     away, turned = (state.pose.t - pose.t).norm(dim=-1) / m.plane.distance, (state.pose.R - pose.R).flatten(1).norm(dim=-1) / 2**0.5

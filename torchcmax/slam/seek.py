@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import mean
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -14,9 +14,9 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.core.window import Window
-from torchcmax.slam.map import Map
-from torchcmax.slam.relocalize import Found, Glimpse, Grid, Relocalizing, found_at, judged, search_far, search_near, seen_at
-from torchcmax.slam.tracker import Belief, ModelName, Sight, Tracking, before_plane, covariance_of, doubt, speed, step
+from torchcmax.slam.glimpse import Glimpse
+from torchcmax.slam.relocalize import Found, Seeking
+from torchcmax.slam.tracker import Belief, ModelName, Sight, Tracking, World, before_plane, covariance_of, doubt, speed, step
 
 LIKELY = 0.6  # share of `accept` that a place must score to be followed
 MOST = 4  # places that are followed at a time
@@ -44,26 +44,44 @@ class Candidate:
 class Searching(NamedTuple):
     """The options of a seeker; certain: px that the image may be off where a camera is found, one sigma."""
 
-    how: Relocalizing
+    how: Seeking
     tracking: Tracking
     model: ModelName
     certain: float
 
 
+class Searchable(Protocol):
+    """A map made ready for searching: as relocalize.Grid."""
+
+    def far(self, glimpse: Glimpse) -> Found:
+        """Where in the whole map a window fits."""
+
+    def near(self, glimpse: Glimpse, expected: State) -> Found:
+        """Where around the expected state [1] a window fits."""
+
+    def at(self, glimpse: Glimpse, pose: Pose) -> Found:
+        """What becomes of poses [K]."""
+
+    def judge(self, glimpse: Glimpse, state: State) -> float:
+        """The score of a state [1]."""
+
+    def seen(self, state: State) -> Tensor:
+        """px on the map of points of the sensor's edge, seen from states [K]: [K, M, 2]."""
+
+
 class Seeker:
     """Looks for a camera in one map.  A search goes on in a thread of its own beside the tracking."""
 
-    def __init__(self, m: Map, canvas: Canvas, sensor: Canvas, rays: Tensor, options: Searching) -> None:
-        """canvas: of the search for motion | sensor: one as large as that | rays [M, 3]: a grid over it"""
+    def __init__(self, m: World, grid: Searchable, canvas: Canvas, sensor: Canvas, rays: Tensor, options: Searching) -> None:
+        """grid: of the map | canvas: of the search for motion | sensor: one as large as that | rays [M, 3]: a grid over it"""
         self.map, self.canvas, self.sensor, self.rays = m, canvas, sensor, rays
         self.how, self.tracking, self.model, self.certain = options
-        how = options.how
-        self.grid = Grid(m, how)
+        self.grid = grid
         self.candidates: list[Candidate] = []
         self.pool = ThreadPoolExecutor(1, "torchcmax-seek")
         self.flight: Future[Found] | None = None
         self.began = self.next = 0  # µs
-        self.pause = how.wait
+        self.pause = self.how.wait
         self.since: list[Window] = []
         self.searches = 0
 
@@ -72,7 +90,7 @@ class Seeker:
         poses = [k.state.pose for k in self.map.keyframes]
         glimpse = Glimpse.of(window, motion, normal, self.sensor, self.map.border)
         every = Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses]))
-        self.candidates = self._kept(found_at(glimpse, self.grid, every, self.how.rounds), window)
+        self.candidates = self._kept(self.grid.at(glimpse, every), window)
 
     def offer(self, window: Window, motion: Motion, normal: Tensor) -> Belief | None:
         """The next window [1], with what it shows alone before a plane with this normal; where the camera is, once that is sure."""
@@ -85,7 +103,7 @@ class Seeker:
         likely = bool(self.candidates) and self.candidates[0].score >= self.how.accept
         if self.flight is None and self.how.far and start >= self.next and not likely:
             glimpse = Glimpse.of(window, motion, normal, self.sensor, self.map.border)
-            self.flight, self.began, self.since = self.pool.submit(search_far, glimpse, self.grid), start, [window]
+            self.flight, self.began, self.since = self.pool.submit(self.grid.far, glimpse), start, [window]
             self.searches += 1
         best = self._sure()
         return None if best is None else self._polished(best, window)
@@ -136,12 +154,12 @@ class Seeker:
 
     def judge(self, window: Window, state: State) -> float:
         """The score of a window [1] at a state [1]."""
-        motion, there = before_plane(state, self.grid.plane)
-        return float(judged(Glimpse.of(window, motion, there.normal, self.sensor, self.grid.border), self.grid, state)[0][0])
+        motion, there = before_plane(state, self.map.plane)
+        return self.grid.judge(Glimpse.of(window, motion, there.normal, self.sensor, self.map.border), state)
 
     def apart(self, one: State, other: State) -> float:
         """px, rms, between what two cameras [1] see."""
-        xy = seen_at(self.grid, State.join([one, other]))
+        xy = self.grid.seen(State.join([one, other]))
         return float((xy[0] - xy[1]).square().sum(-1).mean().sqrt())
 
     def _sure(self) -> Candidate | None:
@@ -160,8 +178,8 @@ class Seeker:
 
     def _polished(self, best: Candidate, window: Window) -> Belief:
         """The best place, or a better one around it."""
-        motion, there = before_plane(best.belief.state, self.grid.plane)
-        near = search_near(Glimpse.of(window, motion, there.normal, self.sensor, self.grid.border), self.grid, best.belief.state)
+        motion, there = before_plane(best.belief.state, self.map.plane)
+        near = self.grid.near(Glimpse.of(window, motion, there.normal, self.sensor, self.map.border), best.belief.state)
         if float(near.score[0]) < BETTER * best.scores[-1]:
             return best.belief
         return Belief(best.belief.time, near.state[:1], covariance_of(SIGMA))

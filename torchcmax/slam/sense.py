@@ -84,9 +84,9 @@ def beyond_chance(supported: float, chance: float) -> float:
 
 
 def decided(information: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """How much of each direction of a step the events decide, and not the prediction: information, prior [12, 12].
+    """How much of each direction of a step the events decide, and not the prediction: information, prior [F, F].
 
-    -> shares [12] from weakest to strongest, 0 where only the prediction speaks, and the directions [12, 12], a column each: the
+    -> shares [F] from weakest to strongest, 0 where only the prediction speaks, and the directions [F, F], a column each: the
     eigenvectors of the information in the metric of what is known with it.
     """
     L, failed = torch.linalg.cholesky_ex(information + prior)
@@ -98,6 +98,6 @@ def decided(information: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     return share.clamp(0, 1), directions / directions.norm(dim=0)
 
 
-def name_of(direction: Tensor) -> str:
-    """The number of a step that a direction [12] has most of."""
-    return NAMES[int(direction.abs().argmax())]
+def name_of(direction: Tensor, free: Tensor) -> str:
+    """The number of a step that a direction [F] has most of, of those that are free [F]."""
+    return NAMES[int(free[direction.abs().argmax()])]

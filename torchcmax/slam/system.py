@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.pose import Trajectory
 from torchcmax.core.window import Window
-from torchcmax.slam.map import Map
-from torchcmax.slam.options import Slam
+from torchcmax.slam.options import Panorama, Slam
+from torchcmax.slam.panorama import PanoramaRun
 from torchcmax.slam.record import Placement, Site, Status, Track
 from torchcmax.slam.run import Run, TooShort
-from torchcmax.slam.tracker import Belief, Sight, Step, step
+from torchcmax.slam.tracker import Belief, Sight, Step, World, step
 from torchcmax.slam.windows import Seen, Source
 
-__all__ = ["Placement", "Slam", "Source", "Status", "System", "TooShort", "Track"]
+__all__ = ["Panorama", "Placement", "Slam", "Source", "Status", "System", "TooShort", "Track"]
 _Task = tuple[Run, Site, Seen, Belief, Sight]
 SAME = 1e-6  # share by which the focal length of a map and of the camera before it may differ
 
@@ -22,9 +22,9 @@ SAME = 1e-6  # share by which the focal length of a map and of the camera before
 class System:
     """Cameras before their planes.  All of one batch have the same sensor; each is tracked as it would be alone."""
 
-    def __init__(self, cameras: Sequence[Camera], options: Slam | None = None, maps: Sequence[Map] | None = None) -> None:
+    def __init__(self, cameras: Sequence[Camera], options: Slam | Panorama | None = None, maps: Sequence[World] | None = None) -> None:
         """maps: tracked against, and left as they are; None: each camera makes its own."""
-        self.options = options or Slam()
+        self.options: Slam | Panorama = options or Slam()
         self.canvas = Canvas.around(cameras[0], self.options.tracking.search.margin)
         if any(Canvas.around(camera, self.options.tracking.search.margin) != self.canvas for camera in cameras):
             raise ValueError("recordings of one batch want the same sensor and focal length; track others in a batch of their own")
@@ -35,15 +35,16 @@ class System:
                 raise ValueError(f"the map wants the sensor that drew it: focal length {m.focal:.2f} px, not {self.canvas.focal:.2f} px")
             if not m.keyframes:
                 raise ValueError("the given map has no keyframe from which its plane could be seen")
-        given: Sequence[Map | None] = maps or [None] * len(cameras)
-        self.runs = [Run(i, camera, self.canvas, self.options, m) for i, (camera, m) in enumerate(zip(cameras, given, strict=True))]
+        given: Sequence[World | None] = maps or [None] * len(cameras)
+        kind = PanoramaRun if isinstance(self.options, Panorama) else Run
+        self.runs = [kind(i, camera, self.canvas, self.options, m) for i, (camera, m) in enumerate(zip(cameras, given, strict=True))]
 
     @property
-    def maps(self) -> list[Map]:
+    def maps(self) -> list[World]:
         """The main one of each recording; ValueError before its first plane."""
         return [run.map for run in self.runs]
 
-    def atlas(self, recording: int = 0) -> list[Map]:
+    def atlas(self, recording: int = 0) -> list[World]:
         """All maps of a recording that were not joined, the main one first."""
         return [site.map for site in self.runs[recording].sites]
 

@@ -22,8 +22,10 @@ from torchcmax.core.pose import Motion
 from torchcmax.core.state import SIZE, State
 from torchcmax.core.warp import TERMS, still
 from torchcmax.core.window import Window
+from torchcmax.slam.globe import Globe
 from torchcmax.slam.map import Area, Map
 
+World = Map | Globe
 ModelName = Literal["planar", "translation", "rotation"]
 SOME = 24  # events that are enough to measure how far a step moves a window
 GRID = 8  # rays along each side of the sensor at which the flow and what is known are measured
@@ -161,15 +163,16 @@ def _at_rest(look: Look, view: View, owner: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a camera sees of a map: the warp H_k [K, 3, 3] of a window onto it, and the area around."""
+    """What a camera sees of a map, or of that part of it: the warp H_k [K, 3, 3] of a window onto it, and the area around."""
 
     map: Map
     H_k: Tensor
     area: Area
 
     @classmethod
-    def of(cls, m: Map, state: State, seconds: Tensor) -> Sight | None:
+    def of(cls, world: World, state: State, seconds: Tensor) -> Sight | None:
         """From a state [1]; None where the camera looks along the plane, or away from it."""
+        m = world.toward(state.pose)
         H_k = m.warp(state, seconds)
         box = m.box(H_k)
         return None if box is None else cls(m, H_k, m.area(box))
@@ -179,7 +182,7 @@ class Sight:
 class Step:
     """What windows gave: belief before and after them, what they show alone, where they match.
 
-    information, prior [B, 12, 12]: about a step in px, of the events and of what was predicted
+    information, prior [B, F, F]: about a step in px, of the events and of what was predicted, of the numbers `free` [F] of a state
     """
 
     before: Belief
@@ -188,6 +191,7 @@ class Step:
     match: Match
     information: Tensor
     prior: Tensor
+    free: Tensor
 
 
 def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight], how: Tracking, name: ModelName = "planar") -> Step:
@@ -196,7 +200,8 @@ def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight]
     alone = front(window, canvas, before.state, plane, how, name)
     size = units(before.state, plane, seconds, canvas.focal)
     basis = basis_of(name, how.matching.refine).to(size)
-    tasks = tasks_of(window, before, sights, how, basis)
+    free = numbers_of(name)
+    tasks = tasks_of(window, before, sights, how, basis, free)
     q = torch.cat([torch.zeros_like(size[:, :6]), before.state.step_to(State(before.state.pose, alone.motion))[:, 6:] / size[:, 6:12]], 1)
     narrow = basis / basis.square().sum(0)  # its columns are orthogonal
     q = q @ narrow[:SIZE]
@@ -207,11 +212,33 @@ def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight]
         q, evaluations = found.x @ narrow, evaluations + found.evaluations
     found = replace(found, evaluations=evaluations)
     information = found.information[:, :SIZE, :SIZE] / (size[:, :SIZE, None] * size[:, None, :SIZE])
-    covariance = torch.linalg.inv(torch.linalg.inv(before.covariance) + information)
+    covariance = within(torch.linalg.inv(block(informed(before.covariance, free) + information, free)), free)
     if how.matching.objective == "variance":  # it does not say how sure it is; nobody asks
         covariance = torch.eye(SIZE).to(covariance).expand_as(covariance)
     after = Belief(before.time, found.state, (covariance + covariance.mT) / 2)
-    return Step(before, after, alone, found, found.information[:, :SIZE, :SIZE], tasks[0].prior[:, :SIZE, :SIZE])
+    return Step(before, after, alone, found, block(found.information, free), block(tasks[0].prior, free), free)
+
+
+def numbers_of(name: ModelName) -> Tensor:
+    """The numbers of a state that a model leaves free: [F]; it is sure of the others."""
+    return torch.tensor([3 * which + axis for which in FREE[name] for axis in range(3)])
+
+
+def block(matrix: Tensor, free: Tensor) -> Tensor:
+    """Its rows and columns of the free numbers: [B, N, N] -> [B, F, F]."""
+    return matrix[:, free[:, None], free]
+
+
+def within(matrix: Tensor, free: Tensor) -> Tensor:
+    """The reverse of `block`, with zeros for the numbers that are not free: [B, F, F] -> [B, 12, 12]."""
+    whole = matrix.new_zeros(len(matrix), SIZE, SIZE)
+    whole[:, free[:, None], free] = matrix
+    return whole
+
+
+def informed(covariance: Tensor, free: Tensor) -> Tensor:
+    """The information that a covariance leaves about the free numbers, the others being sure: [B, 12, 12]."""
+    return within(torch.linalg.inv(block(covariance, free)), free)
 
 
 def basis_of(name: ModelName, refine: str) -> Tensor:
@@ -227,14 +254,14 @@ def basis_of(name: ModelName, refine: str) -> Tensor:
     return torch.cat([rate + pose / 2 for pose, rate in zip(columns[:half], columns[half:], strict=True)], 1)
 
 
-def tasks_of(window: Window, before: Belief, sights: Sequence[Sight], how: Tracking, basis: Tensor) -> list[Task]:
+def tasks_of(window: Window, before: Belief, sights: Sequence[Sight], how: Tracking, basis: Tensor, free: Tensor) -> list[Task]:
     """The windows before their maps, coarse to fine."""
     plane, seconds = Plane.join([s.map.plane for s in sights]), window.duration.double()
     ink = Ink.of(window, window.weight)
     few, some = ink.thinned(how.matching.every), ink.sample(SOME)
     known = Ink.join([s.map.trusted(few[i : i + 1], s.H_k, s.area) for i, s in enumerate(sights)])
     size = units(before.state, plane, seconds, sights[0].map.focal)[:, :SIZE]
-    prior = pad(torch.linalg.inv(before.covariance) * (size[:, :, None] * size[:, None]), (0, 2, 0, 2))
+    prior = pad(informed(before.covariance, free) * (size[:, :, None] * size[:, None]), (0, 2, 0, 2))
     charts = [Chart.join(level) for level in zip(*(s.area.charts for s in sights), strict=True)]
     if how.matching.objective == "lookup":
         return [Task(before.state, plane, seconds, chart, known, some, prior, basis) for chart in charts]

@@ -11,7 +11,7 @@ from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.core.state import State
 from torchcmax.core.window import Window
-from torchcmax.slam.options import Slam
+from torchcmax.slam.options import Panorama, Slam
 from torchcmax.slam.sense import beyond_chance, support
 from torchcmax.slam.tracker import speed
 
@@ -44,7 +44,7 @@ class Seen:
 class Windows:
     """The windows of one source, one after the other."""
 
-    def __init__(self, source: Source, camera: Camera, options: Slam, rays: Tensor, focal: float) -> None:
+    def __init__(self, source: Source, camera: Camera, options: Slam | Panorama, rays: Tensor, focal: float) -> None:
         """rays [M, 3]: a grid over the sensor, by which the speed of the image is told | focal: of these, px"""
         self.source, self.camera, self.tracking, self.sensing = source, camera, options.tracking, options.sensing
         self.rays, self.focal = rays, focal

@@ -1,0 +1,128 @@
+"""Joint optimization of a panorama's keyframes: each finds its place in the image of the others, and all follow one another."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchcmax import kernels
+from torchcmax.core.match import NUMBERS, Matching, match, units
+from torchcmax.core.state import SIZE
+from torchcmax.slam.globe import Facet, Globe
+from torchcmax.slam.map import Area
+from torchcmax.slam.mapper import WORSE, before, met
+
+JUDGES = 6  # keyframes that say whether a round has made the map better
+STEADY = 0.02  # share of its information by which a keyframe stays where it is
+TURN, RATE = slice(0, 3), slice(6, 9)  # of a state's numbers
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Where a keyframe wants to be, given the others: turn [3] rad and change of angular velocity [3] rad/s in its camera's frame.
+
+    information [3, 3] about the turn, per rad^2, whatever the angular velocity
+    """
+
+    turn: Tensor
+    rate: Tensor
+    information: Tensor
+
+
+def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
+    """One round: the last keyframes, or all, find their places in the image of all others; the first one stays, and with it the world.
+
+    The image that a keyframe is matched to goes with those who drew it.  A keyframe i wants to be turned by z_i against the mean of its
+    neighbours j, which see the same with weights w_ij: (theta_i - sum_j w_ij theta_j - z_i)^T A_i (...) -> min over all turns
+    theta at once, so that the error of a closed loop is spread over it in one round, where Gauss-Seidel would take many.
+    Where keyframes then find less in the image of the others than before, the old map stays.
+    """
+    count = len(globe.keyframes)
+    free = range(max(1, count - (last or count)), count)
+    if not free:
+        return globe
+    matching = replace(matching, objective="lookup")
+    wishes = wanted(globe, list(free), matching)
+    if not wishes:
+        return globe
+    turns = together(globe, wishes)
+    keyframes = list(globe.keyframes)
+    for i, wish in wishes.items():
+        step = torch.zeros(1, SIZE, dtype=torch.float64)
+        step[0, TURN], step[0, RATE] = turns[i], wish.rate
+        keyframes[i] = keyframes[i].at(keyframes[i].state.moved(step))
+    fresh = Globe(globe.focal, globe.border, globe.texture, number=globe.number)
+    fresh.draw(keyframes)
+    judges = [count - 1] if last else sorted(wishes)[:: max(1, len(wishes) // JUDGES)]
+    if agreed(fresh, judges, matching, globe.typical()) < WORSE * agreed(globe, judges, matching, globe.typical()):
+        return globe
+    return fresh
+
+
+def among_others(globe: Globe, number: int, typical: float) -> tuple[Facet, Area, Tensor] | None:
+    """The plane before a keyframe, what all others drew there, and its warp H_k [K, 3, 3]; typical: the rate of an edge."""
+    keyframe = globe.keyframes[number]
+    facet = globe.facing(keyframe.state.pose)
+    H_k = facet.warp(keyframe.state, keyframe.seconds)
+    box = facet.box(H_k)
+    if box is None:
+        return None
+    layers = facet.of(globe.layers - globe.layers_of([keyframe]), box)
+    return facet, Area(box, layers, facet.charts(layers, box, facet.texture.blur[-1:], typical)), H_k
+
+
+def agreed(globe: Globe, numbers: list[int], matching: Matching, typical: float) -> float:
+    """What these keyframes meet in the image of the others, in the mean."""
+    found = ((i, among_others(globe, i, typical)) for i in numbers)
+    return sum(met(one[0], globe.keyframes[i], *one[1:], matching) for i, one in found if one is not None) / len(numbers)
+
+
+def wanted(globe: Globe, numbers: list[int], matching: Matching) -> dict[int, Wish]:
+    """What keyframes want."""
+    typical = globe.typical()
+    with ThreadPoolExecutor(kernels.threads()) as pool:
+        wishes = list(pool.map(lambda i: _wish(globe, i, typical, matching), numbers))
+    return {i: wish for i, wish in zip(numbers, wishes, strict=True) if wish is not None}
+
+
+def _wish(globe: Globe, number: int, typical: float, matching: Matching) -> Wish | None:
+    found, keyframe, eye = among_others(globe, number, typical), globe.keyframes[number], torch.eye(NUMBERS, dtype=torch.float64)
+    if found is None:
+        return None
+    facet = found[0]
+    task = before(facet, keyframe, *found[1:], matching, torch.cat([eye[:, TURN], eye[:, RATE]], 1))
+    if task is None:
+        return None
+    one = match(torch.zeros(1, 6, dtype=torch.float64), task, matching)
+    size = units(keyframe.state, facet.plane, keyframe.seconds, facet.focal)[0]
+    x, A = one.x[0] * size, (one.information + task.prior)[0] / (size[:, None] * size)
+    turn = A[TURN, TURN] - A[TURN, RATE] @ torch.linalg.solve(A[RATE, RATE], A[RATE, TURN])
+    return Wish(x[TURN], x[RATE], turn)
+
+
+def together(globe: Globe, wishes: dict[int, Wish]) -> dict[int, Tensor]:
+    """The turns of all keyframes, rad in their cameras' frames, that fulfil their wishes best, together."""
+    index = {i: k for k, i in enumerate(sorted(wishes))}
+    R = torch.cat([k.state.pose.R for k in globe.keyframes])
+    axes = R[:, :, 2]
+    n = len(index)
+    B, z = torch.zeros(n, 3, n, 3, dtype=torch.float64), torch.zeros(n, 3, dtype=torch.float64)
+    stays = torch.zeros(n, 3, n, 3, dtype=torch.float64)
+    for i, k in index.items():
+        apart = (axes @ axes[i]).clamp(-1, 1).arccos()
+        weight = (1 - apart / globe.field_of_view).clamp_min(0).square()
+        weight[i] = 0
+        weight = weight / weight.sum().clamp_min(1e-9)
+        L = torch.linalg.cholesky(wishes[i].information).mT @ R[i].mT  # in its own frame, of a turn in the world's
+        B[k, :, k] += L
+        for j in weight.nonzero()[:, 0].tolist():
+            if j in index:
+                B[k, :, index[j]] -= weight[j] * L
+        z[k] = torch.linalg.cholesky(wishes[i].information).mT @ wishes[i].turn
+        stays[k, :, k] = STEADY**0.5 * L
+    A = torch.cat([B.view(3 * n, 3 * n), stays.view(3 * n, 3 * n)])
+    theta = torch.linalg.solve(A.mT @ A, A.mT @ torch.cat([z.flatten(), torch.zeros(3 * n, dtype=torch.float64)])).view(n, 3)
+    return {i: R[i].mT @ theta[k] for i, k in index.items()}
