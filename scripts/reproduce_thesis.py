@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -20,8 +21,15 @@ from torchcmax.core.pose import Motion
 from torchcmax.core.window import Window
 from torchcmax.folder import writing
 from torchcmax.io import Recording, open
+from torchcmax.panoimage import picture
 from torchcmax.picture import captioned, pictures
+from torchcmax.quality import quality
+from torchcmax.score import score
 from torchcmax.simulator import Simulation, simulate
+from torchcmax.slam.globe import Globe
+from torchcmax.slam.system import Panorama
+from torchcmax.slam.tiles import spread
+from torchcmax.track import TrackOptions, track
 
 THESIS = Look(polarity="signed", reference="first", tilt=0.0)
 """How the draft looks at a window, eq. (2.1), (2.3). The guard is ours: without it the sharpest image is a collapsed one."""
@@ -98,9 +106,26 @@ def side_by_side(window: Window, model: Planar, canvas: Canvas, x: list[Tensor],
     return Image.fromarray(captioned(picture, text))
 
 
+def figure_2_6(recording: Recording) -> tuple[dict[str, object], Image.Image]:
+    """A camera that only turns before a scene of any depth: every window on one panorama."""
+    tracks = track(recording, TrackOptions(Panorama()))
+    every = list(tracks)
+    globe, path = tracks.map, tracks.trajectory()
+    assert isinstance(globe, Globe)
+    found = quality(globe.layers.votes, spread(globe.layers.most) > 0, globe.sphere)
+    report: dict[str, object] = {
+        "figure": "2.6", "recording": recording.name, "windows": len(every), "lost": sum(one.status == "lost" for one in every),
+        "keyframes": len(globe.keyframes), **asdict(found),
+    }  # fmt: skip
+    if recording.truth is not None:
+        report["orientation_rmse_deg"] = score(path, recording.truth, rotation_only=True).orientation_rmse_deg
+    return report, Image.fromarray(picture(globe, path.pose.R, f"panorama of {recording.name}", cropped=True))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--recording", help="with groundtruth.txt and plane.txt; default: a built-in slider before a poster")
+    parser.add_argument("--panorama", help="of a camera that only turns; default: the built-in one that looks round")
     parser.add_argument("--out", type=Path, default=Path("logs/thesis"), help="folder for the figures")
     parser.add_argument("--events", type=int, default=10000, help="events in a window")
     parser.add_argument("--places", type=int, default=6, help="windows looked at")
@@ -108,15 +133,22 @@ def main() -> int:
     torch.set_num_threads(1)
     built_in = Simulation(scene="poster", motion="slider", duration=0.4, tilt=(0.0, 0.0))
     recording = open(options.recording) if options.recording else simulate(built_in)
-    report, picture = figure_2_3(recording, options.events, options.places)
-    options.out.mkdir(parents=True, exist_ok=True)
-    with writing(options.out / "figure_2_3.png") as name:
-        picture.save(name, format="PNG")
-    with writing(options.out / "figure_2_3.json") as name:
+    looking = Simulation(scene="panorama", motion="rotation", duration=1.0)
+    keep(options.out, *figure_2_3(recording, options.events, options.places))
+    keep(options.out, *figure_2_6(open(options.panorama) if options.panorama else simulate(looking)))
+    return 0
+
+
+def keep(folder: Path, report: dict[str, object], drawn: Image.Image) -> None:
+    """A figure in its folder: the picture, and what is said of it."""
+    stem = f"figure_{str(report['figure']).replace('.', '_')}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder / f"{stem}.png") as name:
+        drawn.save(name, format="PNG")
+    with writing(folder / f"{stem}.json") as name:
         name.write_text(json.dumps(report, indent=1) + "\n")
     print(json.dumps(report, indent=1))
-    print(f"picture: {options.out / 'figure_2_3.png'}")
-    return 0
+    print(f"picture: {folder / f'{stem}.png'}")
 
 
 if __name__ == "__main__":

@@ -37,8 +37,12 @@ STILL: Waves = ((), (), ())
 SHIFT: Waves = (((0.125, 0.7, 0.3), (0.035, 1.9, 1.0)), ((0.088, 0.9, 2.6), (0.031, 2.1, 0.4)), ((0.088, 0.6, 3.5), (0.025, 1.7, 2.0)))
 TURN: Waves = (((0.15, 0.8, 0.4), (0.075, 2.0, 3.0)), ((0.225, 0.6, 3.3), (0.1, 1.8, 1.2)), ((0.25, 0.9, 0.2), (0.088, 2.2, 2.2)))
 LOOK_ROUND: Waves = (((0.25, 0.5, 2.9), (0.06, 1.6, 0.5)), ((1.60, 0.2, 0.2), (0.15, 1.1, 1.0)), ((0.20, 0.6, 1.2), (0.07, 1.9, 2.4)))
-MOTIONS = {"6dof": (SHIFT, TURN), "translation": (SHIFT, STILL), "rotation": (STILL, TURN), "slider": (STILL, STILL)}
+NOD: Waves = (((0.30, 0.45, 0.0), (0.05, 1.7, 0.5)), (), ((0.10, 0.35, 0.8), (0.04, 1.3, 2.0)))
+MOTIONS = {
+    "6dof": (SHIFT, TURN), "translation": (SHIFT, STILL), "rotation": (STILL, TURN), "slider": (STILL, STILL), "sweep": (STILL, NOD),
+}  # fmt: skip
 SLIDER = 0.3  # m/s along x
+SWEEP = 2 * math.pi / 3  # rad/s about the vertical: two times round in 6 s
 LIMITS: dict[str, tuple[float, float, str]] = {  # of an option, both allowed: what is beyond wants years, terabytes or more than µs
     "duration": (0.001, 600, " s"), "speed": (0, 100, ""), "distance": (0.01, 10_000, " m"), "width": (8, 2048, " px"),
     "height": (8, 2048, " px"), "focal": (8, 100_000, " px"), "threshold": (0.01, 10, ""), "mismatch": (0, 10, ""),
@@ -74,7 +78,8 @@ class Simulation:
     scene: str = "poster"
     """What the camera sees: poster, shapes, lines: a plane; panorama: a sphere at infinity; or the path of a picture for the plane."""
     motion: str = "6dof"
-    """How the camera moves: 6dof, translation, rotation, or slider (constant velocity along x); a panorama wants rotation."""
+    """How the camera moves: 6dof, translation, rotation, slider (constant velocity along x), or sweep (round and round at 120 deg/s, with
+    nods); a panorama wants rotation or sweep."""
     duration: float = 1.0
     """Length of the recording, s: 0.001 to 600."""
     speed: float = 1.0
@@ -109,8 +114,10 @@ class Simulation:
             raise ValueError(_unknown("scene", self.scene, SCENES, ", or the path of a picture"))
         if self.motion not in MOTIONS:
             raise ValueError(_unknown("motion", self.motion, MOTIONS))
-        if self.scene == "panorama" and self.motion != "rotation":
-            raise ValueError(f"a panorama is infinitely far and shows rotation only: motion wants rotation, got {self.motion!r}")
+        if self.scene == "panorama" and self.motion not in ("rotation", "sweep"):
+            raise ValueError(f"a panorama is infinitely far and shows rotation only: motion wants rotation or sweep, got {self.motion!r}")
+        if self.motion == "sweep" and self.scene != "panorama":
+            raise ValueError(f"a sweep goes round and wants something to see everywhere: scene wants panorama, got {self.scene!r}")
         for name, (least, most, unit) in LIMITS.items():
             if not least <= getattr(self, name) <= most and not (name == "bandwidth" and self.bandwidth == 0):
                 zero = "0, or " if name == "bandwidth" else ""
@@ -146,7 +153,7 @@ def _unknown(option: str, got: str, names: tuple[str, ...] | dict[str, tuple[Wav
 
 def _waves(options: Simulation, time: Tensor, which: int) -> tuple[Tensor, Tensor]:
     """Sum of sinusoids, zero at time zero, and its derivative: time [M] s | which 0 position, 1 rotation vector -> [M, 3], [M, 3]."""
-    waves = LOOK_ROUND if options.scene == "panorama" and which else MOTIONS[options.motion][which]
+    waves = LOOK_ROUND if options.scene == "panorama" and options.motion == "rotation" and which else MOTIONS[options.motion][which]
     value = torch.zeros(len(time), 3, dtype=torch.float64)
     rate = torch.zeros_like(value)
     for axis, terms in enumerate(waves):
@@ -159,16 +166,23 @@ def _waves(options: Simulation, time: Tensor, which: int) -> tuple[Tensor, Tenso
     return value, rate
 
 
+def _sweep(options: Simulation) -> Tensor:
+    """Angular velocity in the world that is added to the waves: [3] rad/s."""
+    return torch.tensor([0.0, SWEEP * options.speed if options.motion == "sweep" else 0.0, 0.0], dtype=torch.float64)
+
+
 def pose(options: Simulation, time: Tensor) -> Pose:
     """T_wc in closed form: time [M] s, float64 -> Pose [M], m."""
-    return Pose(so3.exp(_waves(options, time, 1)[0]), _waves(options, time, 0)[0])
+    turn = so3.exp(_waves(options, time, 1)[0])
+    return Pose(so3.exp(_sweep(options) * time[:, None]) @ turn if options.motion == "sweep" else turn, _waves(options, time, 0)[0])
 
 
 def velocity(options: Simulation, time: Tensor) -> Motion:
     """Velocity of the camera in its own frame, in closed form: time [M] s, float64 -> Motion [M], rad/s and m/s."""
     (turn, turn_rate), (_, shift_rate) = _waves(options, time, 1), _waves(options, time, 0)
     omega = (so3.right_jacobian(turn) @ turn_rate[..., None])[..., 0]
-    return Motion(omega, (so3.exp(turn).mT @ shift_rate[..., None])[..., 0])
+    back = so3.exp(turn).mT
+    return Motion(omega + back @ _sweep(options), (back @ shift_rate[..., None])[..., 0])
 
 
 def simulate(options: Simulation) -> Recording:

@@ -21,13 +21,15 @@ from torchcmax.core.match import NUMBERS, Matching, Task, loosely, match
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.slam.equirect import smooth
-from torchcmax.slam.glimpse import POOL, Glimpse
+from torchcmax.slam.glimpse import Glimpse
 from torchcmax.slam.globe import WALL, Facet, Globe
 from torchcmax.slam.relocalize import FLAT, SHARP, Found, Seeking
 from torchcmax.slam.tracker import SOME
 
 BLUR = 0.4  # of the distance between two orientations that are tried, the blur of map and window
 AT_ONCE = 1 << 21  # points looked up at a time
+POOL, DENSE = 3, 1.4  # px of the window, each way, that are one point: at least, and of the blur
+APART = 12.0  # px that two places are apart at least
 LOOSE = 4.0, 3.0  # px that orientation and angular velocity go when a place is matched to the map, one sigma
 TURNS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
 
@@ -38,7 +40,7 @@ class Turning(Seeking):
 
     steps: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0, 0.5)
     """degrees from one orientation that is tried to the next, coarse to fine."""
-    keep: tuple[int, ...] = (150, 80, 40, 20, 6)
+    keep: tuple[int, ...] = (150, 60, 30, 12, 6)
     """Orientations that go on from each of them."""
 
     def __post_init__(self) -> None:
@@ -115,10 +117,12 @@ class Compass:
             if i > first:
                 R = (R[:, None] @ so3.exp(turns * step)).flatten(0, 1)
             score, _ = self.scores(glimpse, R, max(SHARP, BLUR * step * self.globe.focal))
-            R = R[distinct(R, score, self.how.keep[i], 0.7 * step)]
+            apart = 0.7 * step if i == first else 1.5 * step  # later ones are of basins, of which one place is enough
+            apart = apart if i < len(self.how.steps) - 1 else max(apart, APART / self.globe.focal)
+            R = R[distinct(R, score, self.how.keep[i], apart)]
         state = State.join([self._matched(glimpse, one) for one in R.split(1)])
         score, known = self.scores(glimpse, state.pose.R, SHARP)
-        order = distinct(state.pose.R, score, len(score), 0.5 * math.radians(self.how.steps[-1]))
+        order = distinct(state.pose.R, score, len(score), APART / self.globe.focal)
         state, score, known = state[order], score[order], known[order]
         xyz = self.seen(state)
         return Found(state, score, known, (xyz - xyz[:1]).square().sum(-1).mean(-1).sqrt())
@@ -143,7 +147,7 @@ class Compass:
         """Of orientations [K, 3, 3]: the correlation of window and map, blurred by sigma px, times the root of the share that is
         known, and that share: [K], [K]."""
         level = self.level(sigma)
-        ray, S = glimpse.pooled(max(POOL, round(sigma)), sigma)
+        ray, S = glimpse.pooled(max(POOL, math.ceil(DENSE * sigma)), sigma)
         parts = R.float().split(max(1, AT_ONCE // len(S)))
         with ThreadPoolExecutor(kernels.threads()) as pool:
             found = list(pool.map(lambda part: self._correlated(ray, S, part, level), parts))

@@ -64,7 +64,7 @@ def steady(votes: Tensor, sphere: Sphere) -> Tensor:
     A pixel there is narrow, and few votes fall on each.
     """
     cosine = cosines(sphere)[:, 0]
-    rows = ((cosine < NARROW) & votes.any(1)).nonzero()[:, 0]
+    rows = ((cosine < NARROW) & (votes.sum(1) > 0)).nonzero()[:, 0]
     if not len(rows):
         return votes
     sigma = ROUND * (1 / cosine[rows].square() - 1).sqrt()

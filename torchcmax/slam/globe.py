@@ -26,7 +26,7 @@ WIDEST = 75.0  # degrees from the middle of a facet beyond which there is nothin
 KEPT = 8  # facets that are kept
 PIECE = 32  # keyframes that are drawn at a time
 AHEAD = 0.05  # least z of a unit ray that a camera sees
-SAMPLED = 3  # every so-manieth row and column of the sphere tells what is typical
+SAMPLED = 5  # every so-manieth row and column of the sphere tells what is typical
 WALL = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))
 """Any plane at distance one: what a camera that only turns sees does not depend on it."""
 
@@ -99,10 +99,17 @@ class Facet(Map):
 
 def steps(world: tuple[Tensor, ...], R: Tensor) -> Tensor:
     """How steps along x and y of a facet are steps east and south, but for their length: at rays (x, y, z) [h, w] -> [h, w, 2, 2]."""
-    ray = torch.nn.functional.normalize(torch.stack(world, -1), dim=-1)
-    sides = [axis - ray * (ray * axis).sum(-1, keepdim=True) for axis in (R[:, 0], R[:, 1])]
-    A: Tensor = tangents(ray) @ torch.stack(sides, -1)
-    return A / (A.square().sum((-1, -2), keepdim=True) / 2).sqrt()
+    x, y, z = world
+    long = (x * x + y * y + z * z).rsqrt()
+    x, y, z = x * long, y * long, z * long
+    flat = (x * x + z * z).rsqrt().clamp_max(1e9)
+    rows = []
+    for a, b, c in ((z * flat, None, -x * flat), (-y * x * flat, 1 / flat, -y * z * flat)):  # east, south: they are across the ray
+        rows += [a * R[0, i] + c * R[2, i] + (0 if b is None else b * R[1, i]) for i in (0, 1)]
+    A: Tensor = torch.stack(rows, -1)
+    A = A * (A.square().sum(-1, keepdim=True) / 2).rsqrt()
+    found: Tensor = A.unflatten(-1, (2, 2))
+    return found
 
 
 @dataclass(eq=False)
@@ -177,7 +184,7 @@ class Globe:
         ray, sides = self._cells
         spare = CELL / 2 / self.focal
         low, high = self.border[:, :2].amin(0) - spare, self.border[:, :2].amax(0) + spare
-        index = (ray @ R[:, 2] > AHEAD).nonzero()[:, 0]
+        index = (ray @ R[:, 2] > max(AHEAD, math.cos(self.field_of_view + 2 * spare))).nonzero()[:, 0]
         here = ray[index] @ R
         xy = here[:, :2] / here[:, 2:]
         keep = ((xy >= low) & (xy <= high)).all(-1)

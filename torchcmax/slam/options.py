@@ -43,11 +43,11 @@ class Panorama:
     model: ClassVar[ModelName] = "rotation"
     start: Look = field(default_factory=lambda: Look(contrast="gradient_magnitude"))
     """How windows are looked at before there is a map."""
-    tracking: Tracking = field(default_factory=Tracking)
+    tracking: Tracking = field(default_factory=lambda: Tracking(displacement=16.0, most=50000, seconds=0.06))
     """How windows are tracked."""
     sensing: Sensing = field(default_factory=Sensing)
     """When a window is still, weak or lost."""
-    mapping: Keyframing = field(default_factory=lambda: Keyframing(first=8, settle=2, final=2))
+    mapping: Keyframing = field(default_factory=lambda: Keyframing(first=8, settle=1, every=12))
     """How the map is made."""
     texture: Texture = field(default_factory=Texture)
     """How votes become the strength of edges."""

@@ -56,6 +56,7 @@ class Run:
     """A camera on its way."""
 
     windows: Windows  # where it is begun
+    least = 2  # windows that a map can be made from
 
     def __init__(self, number: int, camera: Camera, canvas: Canvas, options: Slam | Panorama, given: World | None) -> None:
         self.number, self.canvas, self.options, self.given = number, canvas, options, given
@@ -280,15 +281,15 @@ class Run:
         self.lose()
         yield from self.wander(seen, reason)
 
-    def follow(self, site: Site, seen: Seen, found: Step, row: int) -> Iterator[Track]:
-        """A window that was tracked: its status, and what it does to the map."""
+    def follow(self, site: Site, seen: Seen, found: Step, row: int, before: Sight) -> Iterator[Track]:
+        """A window that was tracked, from what was seen before: its status, and what it does to the map."""
         self.belief, strength = found.after[row : row + 1], float(found.match.strength[row])
         tells = self.options.tracking.matching.objective == "lookup"  # how sure it is
         unsure = doubt(self.belief, site.map.plane, self.rays, self.canvas.focal) if tells else float("nan")
         status, reason = self._status(site, strength, unsure, seen.time)
         if reason == FEW:  # keep to what was predicted, or to where it is found near, which is believed when the next window fits there
             self.belief = self._near(site, seen.window, found, row) or found.before[row : row + 1]
-        sight = self.sight(site, seen.window, self.belief)
+        sight = self._refined(site, seen.window, before, reason)
         if sight is None or status == "lost":
             yield from self.blind(seen, ALONG if sight is None else reason)
             return
@@ -355,6 +356,10 @@ class Run:
 
     # what is of a plane, and not of a sphere
 
+    def _refined(self, site: Site, window: Window, before: Sight, reason: str) -> Sight | None:
+        """What the camera sees from where it is now believed to be."""
+        return self.sight(site, window, self._belief)
+
     def _blank(self, plane: Plane, number: int = 0) -> World:
         """A map without anything."""
         return Map(plane, self.canvas.focal, self.border, self.options.texture, number=number)
@@ -377,8 +382,8 @@ class Run:
     def finish(self) -> Iterator[Track]:
         """A map of what there is, where there is none, then all keyframes once more."""
         if not self.sites:
-            if len(self.gathered) < min(2, self.options.mapping.first):
-                few = f"{len(self.gathered)} windows that show motion, at least 2 are wanted"
+            if len(self.gathered) < min(self.least, self.options.mapping.first):
+                few = f"{len(self.gathered)} windows that show motion, at least {self.least} {'are' if self.least > 1 else 'is'} wanted"
                 raise TooShort(f"recording {self.number} holds too few events to begin: {few}")
             yield from self._begin()
         yield from self._early_tracks()

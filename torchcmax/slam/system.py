@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
 
 from torchcmax.core.camera import Camera, Canvas
+from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
 from torchcmax.core.window import Window
 from torchcmax.slam.options import Panorama, Slam
 from torchcmax.slam.panorama import PanoramaRun
 from torchcmax.slam.record import Placement, Site, Status, Track
 from torchcmax.slam.run import Run, TooShort
-from torchcmax.slam.tracker import Belief, Sight, Step, World, step
+from torchcmax.slam.tracker import Belief, World, front, step
 from torchcmax.slam.windows import Seen, Source
 
 __all__ = ["Panorama", "Placement", "Slam", "Source", "Status", "System", "TooShort", "Track"]
-_Task = tuple[Run, Site, Seen, Belief, Sight]
+_Task = tuple[Run, Site, Seen, Belief]
 SAME = 1e-6  # share by which the focal length of a map and of the camera before it may differ
 
 
@@ -36,6 +40,7 @@ class System:
             if not m.keyframes:
                 raise ValueError("the given map has no keyframe from which its plane could be seen")
         given: Sequence[World | None] = maps or [None] * len(cameras)
+        self.beside = ThreadPoolExecutor(1, "torchcmax-sight")
         kind = PanoramaRun if isinstance(self.options, Panorama) else Run
         self.runs = [kind(i, camera, self.canvas, self.options, m) for i, (camera, m) in enumerate(zip(cameras, given, strict=True))]
 
@@ -69,18 +74,23 @@ class System:
                     yield from run.wander(seen)
                 elif seen.noise:
                     yield run.hold(site, seen)
-                elif (sight := run.sight(site, seen.window, before := run.predicted(seen.window))) is None:
-                    yield from run.blind(seen)
                 else:
-                    tasks.append((run, site, seen, before, sight))
+                    tasks.append((run, site, seen, run.predicted(seen.window)))
             if tasks:
-                found = self._step(tasks)
-                for i, (run, site, seen, _, _) in enumerate(tasks):
-                    yield from run.follow(site, seen, found, i)
+                yield from self._step(tasks)
         for run in self.runs:
             yield from run.finish()
 
-    def _step(self, tasks: Sequence[_Task]) -> Step:
-        _, _, seen, before, sights = zip(*tasks, strict=True)
-        windows = Window.join([one.window for one in seen])
-        return step(windows, self.canvas, Belief.join(before), sights, self.options.tracking, self.options.model)
+    def _step(self, tasks: Sequence[_Task]) -> Iterator[Track]:
+        """Windows on their maps.  What they see there is looked up beside the search for what they show alone."""
+        sights = [self.beside.submit(run.sight, site, seen.window, before) for run, site, seen, before in tasks]
+        windows, before = Window.join([task[2].window for task in tasks]), Belief.join([task[3] for task in tasks])
+        plane, (how, model) = Plane.join([task[1].map.plane for task in tasks]), (self.options.tracking, self.options.model)
+        alone = front(windows, self.canvas, before.state, plane, how, model)
+        seeing = {i: sight for i, future in enumerate(sights) if (sight := future.result()) is not None}
+        rows = torch.tensor(list(seeing), dtype=torch.int64)
+        if seeing:
+            found = step(windows[rows], self.canvas, before[rows], list(seeing.values()), how, model, alone[rows])
+        order = {i: row for row, i in enumerate(seeing)}
+        for i, (run, site, seen, _) in enumerate(tasks):
+            yield from run.follow(site, seen, found, order[i], seeing[i]) if i in order else run.blind(seen)

@@ -136,6 +136,11 @@ class Front:
     evaluations: Tensor
     converged: Tensor
 
+    def __getitem__(self, rows: Tensor) -> Front:
+        """Some of the windows."""
+        motion = Motion(self.motion.omega[rows], self.motion.velocity[rows])
+        return Front(motion, self.zero[rows], self.contrast[rows], self.evaluations[rows], self.converged[rows])
+
 
 def front(window: Window, canvas: Canvas, expected: State, plane: Plane, how: Tracking, name: ModelName = "planar") -> Front:
     """The motion that makes each window sharp on the blank canvas before the known plane [B], from the expected state's on."""
@@ -177,6 +182,10 @@ class Sight:
         box = m.box(H_k)
         return None if box is None else cls(m, H_k, m.area(box))
 
+    def moved(self, state: State, seconds: Tensor) -> Sight:
+        """The same area from a state [1] a few px on."""
+        return replace(self, H_k=self.map.warp(state, seconds))
+
 
 @dataclass(frozen=True)
 class Step:
@@ -194,10 +203,22 @@ class Step:
     free: Tensor
 
 
-def step(window: Window, canvas: Canvas, before: Belief, sights: Sequence[Sight], how: Tracking, name: ModelName = "planar") -> Step:
-    """The windows [B] of cameras against what they see of their maps, from what is predicted for their middles: make sharp, match."""
+def step(
+    window: Window,
+    canvas: Canvas,
+    before: Belief,
+    sights: Sequence[Sight],
+    how: Tracking,
+    name: ModelName = "planar",
+    alone: Front | None = None,
+) -> Step:
+    """The windows [B] of cameras against what they see of their maps, from what is predicted for their middles: make sharp, match.
+
+    alone: what they show by themselves, where that is there already
+    """
     plane, seconds = Plane.join([s.map.plane for s in sights]), window.duration.double()
-    alone = front(window, canvas, before.state, plane, how, name)
+    if alone is None:
+        alone = front(window, canvas, before.state, plane, how, name)
     size = units(before.state, plane, seconds, canvas.focal)
     basis = basis_of(name, how.matching.refine).to(size)
     free = numbers_of(name)

@@ -1,0 +1,111 @@
+"""A camera that only turns, tracked and mapped: the bars that the project set itself, the full circle, the pole, loss, real windows."""
+
+import math
+
+import pytest
+import torch
+from accuracy import ROTATIONS, whole
+from panoramas import found, turns
+
+from torchcmax import simulator
+from torchcmax.core.estimate import estimate
+from torchcmax.core.model import Rotation
+from torchcmax.io import open
+from torchcmax.score import score
+from torchcmax.simulator import Simulation, simulate
+from torchcmax.slam.globe import Globe
+from torchcmax.slam.system import Panorama
+from torchcmax.track import TrackOptions, track
+
+SMALL = {"width": 120, "height": 90, "focal": 100.0}
+
+
+def followed(recording, **options):
+    """Its tracks, gone through, and each of them."""
+    tracks = track(recording, TrackOptions(Panorama(), **options))
+    return tracks, list(tracks)
+
+
+@pytest.fixture(scope="module")
+def outdoors(shared):
+    """The simulated street, tracked."""
+    return followed(open(shared / "data/sim/rotation_panorama_sim"))
+
+
+@pytest.mark.slow
+def test_the_simulated_street_is_tracked_from_nothing_to_the_end(outdoors):
+    tracks, every = outdoors
+    error = score(tracks.trajectory(), tracks.recording.truth, rotation_only=True)
+    assert not [one.index for one in every if one.status == "lost"]
+    assert error.orientation_rmse_deg < 0.25
+    assert error.coverage == 1
+    assert not tracks.trajectory().pose.t.any()
+    assert isinstance(tracks.map, Globe)
+
+
+@pytest.mark.slow
+def test_a_camera_is_found_anywhere_in_the_finished_panorama(outdoors):
+    tracks, _ = outdoors
+    numbers = found(tracks, 10)
+    assert numbers["within 0.5 deg"] == 10
+    assert numbers["wrong"] == 0
+
+
+@pytest.fixture(scope="module")
+def round_and_round():
+    """Two times round, with nods."""
+    return followed(simulate(Simulation(scene="panorama", motion="sweep", duration=6.0, **SMALL)))
+
+
+@pytest.mark.slow
+def test_a_full_circle_closes_on_itself(round_and_round):
+    tracks, every = round_and_round
+    assert not [one.index for one in every if one.status == "lost"]
+    ends = turns(tracks, 3.0)
+    assert ends["end of turn 2, deg"] <= ends["end of turn 1, deg"] + 0.1
+    assert ends["end of turn 1, deg"] < 0.3
+    assert score(tracks.trajectory(), tracks.recording.truth, rotation_only=True).orientation_rmse_deg < 0.3
+
+
+@pytest.mark.slow
+def test_no_edges_are_doubled_where_the_circle_closes(round_and_round):
+    """In the second turn, windows meet as much where the two ends of the first one overlap as elsewhere."""
+    _, every = round_and_round
+    late = [one for one in every if one.time > 3.3e6 and one.signs.strength == one.signs.strength]
+    seam, rest = [], []
+    for one in late:
+        degrees = float(torch.atan2(one.state.pose.R[0, 0, 2], one.state.pose.R[0, 2, 2]).rad2deg())
+        (seam if abs(degrees) < 45 else rest).append(one.signs.strength)
+    assert len(seam) >= 5
+    assert sum(seam) / len(seam) > 0.85 * sum(rest) / len(rest)
+
+
+def test_a_camera_is_tracked_over_the_pole(monkeypatch):
+    monkeypatch.setattr(simulator, "LOOK_ROUND", (((1.9, 0.25, 0.0),), ((0.15, 0.5, 0.0),), ((0.1, 0.7, 0.0),)))
+    tracks, every = followed(simulate(Simulation(scene="panorama", motion="rotation", duration=1.0, **SMALL)))
+    path = tracks.trajectory()
+    assert path.pose.R[:, 1, 2].abs().max() > 0.99  # it looks along the axis
+    assert path.pose.R[-1, 2, 2] < 0  # and beyond it
+    assert not [one.index for one in every if one.status == "lost"]
+    assert score(path, tracks.recording.truth, rotation_only=True).orientation_rmse_deg < 0.3
+
+
+@pytest.mark.parametrize("name", ["boxes_rotation", "boxes_rotation_13s", "dynamic_rotation"])
+def test_single_real_windows_are_as_sharp_as_the_estimator_makes_them(shared, monkeypatch, name):
+    monkeypatch.syspath_prepend(str(shared / "tools"))
+    from score_motion import score as judge
+
+    folder = shared / "data/real/ecd" / name
+    _, (one,) = followed(open(folder))
+    camera, window = whole(folder)
+    best = estimate(window, camera, Rotation(camera.fx)).motion.omega[0]
+    ours, theirs = (judge(folder, omega.tolist())["middle_sigma1"]["gain"] for omega in (one.state.motion.omega[0], best))
+    assert ours - 1 >= 0.99 * (theirs - 1)
+
+
+def test_the_real_shapes_turn_as_is_known(shared):
+    _, every = followed(open(shared / "data/real/ecd/shapes_rotation_2s"))
+    seconds = torch.cat([one.window.duration.double() for one in every])
+    omega = torch.cat([one.state.motion.omega for one in every])
+    mean = (omega * seconds[:, None]).sum(0) / seconds.sum()
+    assert (mean - torch.tensor(ROTATIONS["shapes_rotation_2s"])).norm() * 180 / math.pi < 1.5
