@@ -37,7 +37,7 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
 
     The image that a keyframe is matched to goes with those who drew it.  A keyframe i wants to be turned by z_i against the mean of its
     neighbours j, which see the same with weights w_ij: (theta_i - sum_j w_ij theta_j - z_i)^T A_i (...) -> min over all turns
-    theta at once, so that the error of a closed loop is spread over it in one round, where Gauss-Seidel would take many.
+    theta at once.  So what a closed circle is off is spread over the keyframes around, and from round to round over all of it.
     Where keyframes then find less in the image of the others than before, the old map stays.
     """
     count = len(globe.keyframes)

@@ -69,15 +69,18 @@ def steady(votes: Tensor, sphere: Sphere) -> Tensor:
         return votes
     sigma = ROUND * (1 / cosine[rows].square() - 1).sqrt()
     votes = votes.clone()
-    votes[rows] = around(votes[rows], sigma[:, None])
+    votes[rows] = around(votes[rows], sigma[:, None]).clamp_min_(0)  # rounding
     return votes
 
 
 def around(rows: Tensor, sigma: Tensor) -> Tensor:
-    """Rows that close on themselves, blurred by Gaussians of sigma [R, 1] px: [..., R, W] -> [..., R, W]."""
+    """Rows that close on themselves, blurred by discrete Gaussians of sigma [R, 1] px: [..., R, W] -> [..., R, W].
+
+    Their transfer function is exp(sigma^2 (cos w - 1)) (Lindeberg 1990): as narrow as they may be, they are nowhere negative.
+    """
     width = rows.shape[-1]
     wave = 2 * math.pi * torch.arange(width // 2 + 1, dtype=rows.dtype) / width
-    soft: Tensor = torch.fft.irfft(torch.fft.rfft(rows) * torch.exp(-0.5 * (sigma * wave).square()), n=width)
+    soft: Tensor = torch.fft.irfft(torch.fft.rfft(rows) * torch.exp(sigma.square() * (wave.cos() - 1)), n=width)
     return soft
 
 

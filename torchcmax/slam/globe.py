@@ -26,7 +26,6 @@ WIDEST = 75.0  # degrees from the middle of a facet beyond which there is nothin
 KEPT = 8  # facets that are kept
 PIECE = 32  # keyframes that are drawn at a time
 AHEAD = 0.05  # least z of a unit ray that a camera sees
-SAMPLED = 5  # every so-manieth row and column of the sphere tells what is typical
 WALL = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))
 """Any plane at distance one: what a camera that only turns sees does not depend on it."""
 
@@ -210,13 +209,16 @@ class Globe:
     def typical(self) -> float:
         """The rate that an event meets on average: sum r^2 / sum r over the sphere."""
         if self._typical is None:
-            rate, area = self.rate()[::SAMPLED, ::SAMPLED], cosines(self.sphere)[::SAMPLED]
+            seen = self.layers.most.sum(1).nonzero()[:, 0]
+            rows = slice(int(seen[0]) * CELL, (int(seen[-1]) + 1) * CELL) if len(seen) else slice(0)
+            rate, area = self.rate(rows), cosines(self.sphere)[rows]
             self._typical = float((rate.square() * area).sum() / (rate * area).sum().clamp_min(1e-9))
         return self._typical
 
-    def rate(self) -> Tensor:
-        """Votes per px of motion along the direction of most motion: [H, W]."""
-        return self.layers.votes * spread(1 / self.layers.most.clamp_min(self.texture.least))
+    def rate(self, rows: slice = slice(None)) -> Tensor:
+        """Votes per px of motion along the direction of most motion: [H, W], or some rows of it, in whole cells."""
+        cells = slice(*(None if i is None else i // CELL for i in (rows.start, rows.stop)))
+        return self.layers.votes[rows] * spread(1 / self.layers.most[cells].clamp_min(self.texture.least))
 
     def strength(self) -> Tensor:
         """The rate, saturated, in 0..1: [H, W]."""
