@@ -125,7 +125,7 @@ def main() -> int:
         runs.append((tracks, numbers | turns(tracks, 3.0)))
     table([numbers for _, numbers in runs])
     if options.found:
-        table([found(tracks, options.found) for tracks, _ in runs])
+        table([found(tracks, options.found) for tracks, _ in runs[: len(options.recording)]])
     return 0
 
 

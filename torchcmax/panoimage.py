@@ -44,11 +44,13 @@ def picture(globe: Globe, turns: Tensor, title: str, most: int = LARGEST, croppe
 
 def _images(globe: Globe, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Strength [H, W] and what was seen, reduced so that no side is longer than `most` px."""
-    strength = smooth(globe.strength(), SOFT, globe.sphere)
+    strength = globe.strength()
     seen = spread((globe.layers.most > 0).to(strength))
     height = min(globe.sphere.height, most // 2)
     if height < globe.sphere.height:
         strength, seen = (adaptive_avg_pool2d(part[None], (height, 2 * height))[0] for part in (strength, seen))
+    else:
+        strength = smooth(strength, SOFT, globe.sphere)
     return strength.cpu().numpy(), seen.cpu().numpy() > 0
 
 

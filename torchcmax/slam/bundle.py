@@ -24,12 +24,14 @@ TURN, RATE = slice(0, 3), slice(6, 9)  # of a state's numbers
 class Wish:
     """Where a keyframe wants to be, given the others: turn [3] rad and change of angular velocity [3] rad/s in its camera's frame.
 
-    information [3, 3] about the turn, per rad^2, whatever the angular velocity
+    information [3, 3] about the turn, per rad^2, whatever the angular velocity | met: the mean strength of the others that
+    its events meet, where it was asked
     """
 
     turn: Tensor
     rate: Tensor
     information: Tensor
+    met: float = 0.0
 
 
 def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
@@ -45,7 +47,8 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
     if not free:
         return globe
     matching = replace(matching, objective="lookup")
-    wishes = wanted(globe, list(free), matching)
+    judges = [count - 1] if last else list(free)[:: max(1, len(free) // JUDGES)]
+    wishes = wanted(globe, list(free), matching, judges)
     if not wishes:
         return globe
     turns = together(globe, wishes)
@@ -56,8 +59,8 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
         keyframes[i] = keyframes[i].at(keyframes[i].state.moved(step))
     fresh = Globe(globe.focal, globe.border, globe.texture, number=globe.number)
     fresh.draw(keyframes)
-    judges = [count - 1] if last else sorted(wishes)[:: max(1, len(wishes) // JUDGES)]
-    if agreed(fresh, judges, matching, globe.typical()) < WORSE * agreed(globe, judges, matching, globe.typical()):
+    before = sum(wishes[i].met for i in judges if i in wishes) / len(judges)
+    if agreed(fresh, judges, matching, globe.typical()) < WORSE * before:
         return globe
     return fresh
 
@@ -76,19 +79,24 @@ def among_others(globe: Globe, number: int, typical: float) -> tuple[Facet, Area
 
 def agreed(globe: Globe, numbers: list[int], matching: Matching, typical: float) -> float:
     """What these keyframes meet in the image of the others, in the mean."""
-    found = ((i, among_others(globe, i, typical)) for i in numbers)
-    return sum(met(one[0], globe.keyframes[i], *one[1:], matching) for i, one in found if one is not None) / len(numbers)
+
+    def of(number: int) -> float:
+        found = among_others(globe, number, typical)
+        return 0.0 if found is None else met(found[0], globe.keyframes[number], *found[1:], matching)
+
+    with ThreadPoolExecutor(kernels.threads()) as pool:
+        return sum(pool.map(of, numbers)) / len(numbers)
 
 
-def wanted(globe: Globe, numbers: list[int], matching: Matching) -> dict[int, Wish]:
-    """What keyframes want."""
+def wanted(globe: Globe, numbers: list[int], matching: Matching, judges: list[int]) -> dict[int, Wish]:
+    """What keyframes want, and, of the judges, what they meet."""
     typical = globe.typical()
     with ThreadPoolExecutor(kernels.threads()) as pool:
-        wishes = list(pool.map(lambda i: _wish(globe, i, typical, matching), numbers))
+        wishes = list(pool.map(lambda i: _wish(globe, i, typical, matching, i in judges), numbers))
     return {i: wish for i, wish in zip(numbers, wishes, strict=True) if wish is not None}
 
 
-def _wish(globe: Globe, number: int, typical: float, matching: Matching) -> Wish | None:
+def _wish(globe: Globe, number: int, typical: float, matching: Matching, asked: bool) -> Wish | None:
     found, keyframe, eye = among_others(globe, number, typical), globe.keyframes[number], torch.eye(NUMBERS, dtype=torch.float64)
     if found is None:
         return None
@@ -100,7 +108,7 @@ def _wish(globe: Globe, number: int, typical: float, matching: Matching) -> Wish
     size = units(keyframe.state, facet.plane, keyframe.seconds, facet.focal)[0]
     x, A = one.x[0] * size, (one.information + task.prior)[0] / (size[:, None] * size)
     turn = A[TURN, TURN] - A[TURN, RATE] @ torch.linalg.solve(A[RATE, RATE], A[RATE, TURN])
-    return Wish(x[TURN], x[RATE], turn)
+    return Wish(x[TURN], x[RATE], turn, met(facet, keyframe, *found[1:], matching) if asked else 0.0)
 
 
 def together(globe: Globe, wishes: dict[int, Wish]) -> dict[int, Tensor]:

@@ -43,7 +43,7 @@ class Panorama:
     model: ClassVar[ModelName] = "rotation"
     start: Look = field(default_factory=lambda: Look(contrast="gradient_magnitude"))
     """How windows are looked at before there is a map."""
-    tracking: Tracking = field(default_factory=lambda: Tracking(displacement=16.0, most=50000, seconds=0.06))
+    tracking: Tracking = field(default_factory=lambda: Tracking(displacement=20.0, most=50000, seconds=0.06))
     """How windows are tracked."""
     sensing: Sensing = field(default_factory=Sensing)
     """When a window is still, weak or lost."""
