@@ -13,6 +13,7 @@ import time
 import warnings
 
 import torch
+from lost import table
 from torch import Tensor
 
 from torchcmax import kernels, open
@@ -96,15 +97,6 @@ def apart(one: Pose, other: Pose) -> float:
     """degrees between two orientations [1]."""
     turn: Tensor = so3.log(one.R.mT @ other.R)
     return float(turn.norm().rad2deg())
-
-
-def table(rows: list[dict[str, object]]) -> None:
-    """As Markdown."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
-    for row in rows:
-        print("| " + " | ".join(str(row.get(name, "")) for name in columns) + " |", flush=True)
-    print()
 
 
 def main() -> int:

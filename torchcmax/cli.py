@@ -237,8 +237,16 @@ def run_track(config: Namespace) -> int:
         for one in tracks:
             report.add(one)
             bar.update()
-    print(f"{told(report)}\ntrajectory: {out / 'trajectory.txt'}\nmap: {out / 'map.png'}\ncurves: tensorboard --logdir {out}")
+    _say_where(report, "map: map.png")
     return 0
+
+
+def _say_where(report: TrackReport, picture: str) -> None:
+    """How it went, and where to look; picture: what it shows, and its file."""
+    shown, name = picture.split(": ")
+    lines = [told(report)]
+    lines += [f"{what}: {report.folder / file}" for what, file in (("trajectory", "trajectory.txt"), (shown, name)) if file in report.files]
+    print("\n".join([*lines, f"curves: tensorboard --logdir {report.folder}"]))
 
 
 def told(report: TrackReport) -> str:
@@ -267,7 +275,7 @@ def run_panorama(config: Namespace) -> int:
         for one in tracks:
             report.add(one)
             bar.update()
-    print(f"{told(report)}\ntrajectory: {out / 'trajectory.txt'}\npanorama: {out / 'panorama.png'}\ncurves: tensorboard --logdir {out}")
+    _say_where(report, "panorama: panorama.png")
     return 0
 
 

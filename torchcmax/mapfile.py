@@ -27,7 +27,9 @@ from torchcmax.slam.map import Keyframe, Map, Texture
 from torchcmax.slam.tiles import CELL, TILE, Layers, spread
 
 FORMATS, VERSION = {Map: "torchcmax map", Globe: "torchcmax panorama"}, 1
-FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, UnicodeDecodeError)  # what h5py raises on broken files
+FAILURES = (  # what h5py and we raise on broken files
+    OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, UnicodeDecodeError, OverflowError, AttributeError,
+)  # fmt: skip
 PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 STORED = 1 << 16  # events per compressed piece
 SPARE = 8 << 20  # bytes asked of the disk beside the map: HDF5 crashes the process when it finds it full
@@ -119,7 +121,10 @@ def load_map(path: Path | str) -> Map | Globe:
             m = Globe(focal, _tensor(file["border"], None, 3), texture, number=number)
             height, width = m.sphere.size
             cells = 3, height // CELL, width // CELL
-            m.layers = Layers(_tensor(file["sphere/votes"], height, width), _tensor(file["sphere/exposure"], *cells))
+            votes, exposure = _tensor(file["sphere/votes"], height, width), _tensor(file["sphere/exposure"], *cells)
+            if votes.dtype != torch.float32 or exposure.dtype != torch.float32 or (votes < 0).any():
+                raise ValueError("sphere/votes and sphere/exposure want float32, and votes of at least 0")
+            m.layers = Layers(votes, exposure)
         else:
             plane = Plane(_tensor(file["plane/normal"], 1, 3), _tensor(file["plane/distance"], 1))
             m = Map(plane, focal, _tensor(file["border"], None, 3), texture, number=number)

@@ -61,13 +61,10 @@ def _axes(globe: Globe, turns: Tensor, height: int) -> np.ndarray:
 
 
 def _opening(seen: np.ndarray) -> int:
-    """The column from which on what was seen lies in one piece: behind the widest gap; 0 where there is none."""
-    columns = np.asarray(seen.any(0))
-    if columns.all() or (not columns[0] and not columns[-1]):
-        return 0
-    empty = np.flatnonzero(~columns)
-    ends = np.flatnonzero(np.diff(empty) > 1)
-    starts = np.concatenate([[0], ends + 1])
-    stops = np.concatenate([ends, [len(empty) - 1]])
-    widest = int((stops - starts).argmax())
-    return int((empty[starts[widest]] + empty[stops[widest]]) // 2)
+    """The column from which on what was seen lies in one piece: in the middle of the widest gap, round; 0 where there is none."""
+    columns = np.flatnonzero(np.asarray(seen.any(0)))
+    width = seen.shape[1]
+    gaps = np.diff(columns, append=columns[0] + width)
+    widest = int(gaps.argmax())
+    inside = widest == len(columns) - 1 and columns[0] > 0 and columns[-1] < width - 1  # the seam is in it already
+    return 0 if gaps[widest] == 1 or inside else int(columns[widest] + gaps[widest] // 2) % width

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcmax.core.camera import Sphere
-from torchcmax.core.contrast import blur
-from torchcmax.slam.equirect import cosines
+from torchcmax.slam.equirect import cosines, smooth
 
 SIGMA = 1.0  # px of blur before gradients are taken
 
@@ -40,7 +39,7 @@ def quality(votes: Tensor, seen: Tensor, sphere: Sphere) -> Quality:
     width = cosines(sphere).to(votes)
     area = width.expand_as(votes)
     held = float((area * (1 - torch.exp(-votes.clamp_min(0)))).sum())
-    soft = blur(votes[None], SIGMA)[0]
+    soft = smooth(votes, SIGMA, sphere)
     down = (soft[2:] - soft[:-2]) / 2
     east = (soft.roll(-1, 1) - soft.roll(1, 1))[1:-1] / 2 / width[1:-1]
     inner, where = area[1:-1], (seen[2:] & seen[:-2] & seen[1:-1]).to(votes)

@@ -55,7 +55,12 @@ class Tracks:
         """Nothing is read before the first track is asked for, but for the saved map."""
         self.recording, self.options = recording, options
         saved = None if options.map is None else [_saved(options)]
-        self.system = System([recording.camera], options.slam, saved)
+        try:
+            self.system = System([recording.camera], options.slam, saved)
+        except ValueError as error:
+            if options.map is None:
+                raise
+            raise DataError(options.map, f"cannot be tracked against: {error}", "give a map that this camera drew") from error
         self.stream = recording.stream(options.begin, options.end, options.device)
 
     def __iter__(self) -> Iterator[Track]:

@@ -1,5 +1,7 @@
 """Whole recordings with the default options: the bars that the project set itself."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from torchcmax.score import score
 from torchcmax.slam.tiles import spread
 from torchcmax.track import TrackOptions, track
 
+SCRIPT = Path(__file__).parents[2] / "scripts" / "tracking.py"
 BARS = {  # % of the plane's distance, degrees, coverage
     "poster_6dof_sim": (0.4, 0.4, 0.99),
     "poster_translation_sim": (0.4, 0.4, 0.99),
@@ -25,15 +28,17 @@ BARS = {  # % of the plane's distance, degrees, coverage
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_simulated_recordings_are_tracked_from_nothing_to_the_end(shared, name):
-    recording = open(shared / "data/sim" / name)
-    tracks = track(recording)
-    lost = sum(one.status == "lost" for one in tracks)
-    found = score(tracks.trajectory(), recording.truth, recording.plane)
+    """In a process of its own, as a user runs it: on slider_far_sim the last bit decides how the plane leans (docs/benchmarks.md), and
+    it depends on where in memory the tests before have left room."""
+    command = [sys.executable, SCRIPT, shared / "data/sim" / name, "--threads", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    head, _, line = (row.strip("| ").split(" | ") for row in done.stdout.splitlines()[:3])
+    found = dict(zip(head, (cell.strip() for cell in line), strict=True))
     percent, degrees, coverage = BARS[name]
-    assert lost == 0
-    assert found.percent_of_distance < percent
-    assert found.orientation_rmse_deg < degrees
-    assert found.coverage >= coverage
+    assert float(found["lost_s"]) == 0
+    assert float(found["position_%"]) < percent
+    assert float(found["orientation_deg"]) < degrees
+    assert float(found["coverage"]) >= coverage
 
 
 def sharpness(image, weight):

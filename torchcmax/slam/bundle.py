@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcmax import kernels
+from torchcmax.core import so3
 from torchcmax.core.match import NUMBERS, Matching, match, units
 from torchcmax.core.state import SIZE
 from torchcmax.slam.globe import Facet, Globe
@@ -43,17 +44,19 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
     Where keyframes then find less in the image of the others than before, the old map stays.
     """
     count = len(globe.keyframes)
-    free = range(max(1, count - (last or count)), count)
-    if not free:
+    free = range(max(0, count - (last or count)), count)
+    if count < 2:
         return globe
     matching = replace(matching, objective="lookup")
     judges = [count - 1] if last else list(free)[:: max(1, len(free) // JUDGES)]
     wishes = wanted(globe, list(free), matching, judges)
     if not wishes:
         return globe
-    turns = together(globe, wishes)
+    turns = held(globe, together(globe, wishes))
     keyframes = list(globe.keyframes)
     for i, wish in wishes.items():
+        if i == 0:
+            continue
         step = torch.zeros(1, SIZE, dtype=torch.float64)
         step[0, TURN], step[0, RATE] = turns[i], wish.rate
         keyframes[i] = keyframes[i].at(keyframes[i].state.moved(step))
@@ -63,6 +66,18 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
     if agreed(fresh, judges, matching, globe.typical()) < WORSE * before:
         return globe
     return fresh
+
+
+def held(globe: Globe, turns: dict[int, Tensor]) -> dict[int, Tensor]:
+    """The same turns [3] rad with all that were turned back so that the first keyframe, if it was, stays, and with it the world.
+
+    Its wish counts as the others' do; else they would all turn away from it, round by round.
+    """
+    if 0 not in turns:
+        return turns
+    R = [globe.keyframes[i].state.pose.R[0] for i in range(len(globe.keyframes))]
+    back = (R[0] @ so3.exp(turns[0]) @ R[0].mT).mT
+    return {i: so3.log(R[i].mT @ back @ R[i] @ so3.exp(turn)) if i else torch.zeros_like(turn) for i, turn in turns.items()}
 
 
 def among_others(globe: Globe, number: int, typical: float) -> tuple[Facet, Area, Tensor] | None:

@@ -22,8 +22,8 @@ from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.slam.equirect import smooth
 from torchcmax.slam.glimpse import Glimpse
-from torchcmax.slam.globe import WALL, Facet, Globe
-from torchcmax.slam.relocalize import FLAT, SHARP, Found, Seeking
+from torchcmax.slam.globe import WALL, Globe
+from torchcmax.slam.relocalize import SHARP, Found, Seeking, compared
 from torchcmax.slam.tracker import SOME
 
 BLUR = 0.4  # of the distance between two orientations that are tried, the blur of map and window
@@ -131,7 +131,7 @@ class Compass:
         """One orientation [1, 3, 3], with the window's angular velocity, matched to the map."""
         nowhere = torch.zeros(1, 3, dtype=torch.float64)
         state = State(Pose(R, nowhere), Motion(glimpse.motion.omega, nowhere))
-        facet: Facet = self.globe.toward(state.pose)
+        facet = self.globe.facing(state.pose)  # kept ones would be shared by threads, and make a search depend on the one before
         box = facet.box(facet.warp(state, glimpse.seconds))
         if box is None:
             return state
@@ -160,13 +160,7 @@ class Compass:
         column = (torch.atan2(x, z) * level.sphere.focal + level.sphere.centre[0]).round().long() % width
         row = (torch.atan2(y, (x * x + z * z).sqrt()) * level.sphere.focal + level.sphere.centre[1]).round().long().clamp(0, height - 1)
         place = row * width + column
-        w, T = level.known[place], level.strength[place]
-        n = w.sum(1, keepdim=True).clamp_min(1)
-        T, S = (T - (T * w).sum(1, keepdim=True) / n) * w, (S - (S * w).sum(1, keepdim=True) / n) * w
-        scale = (T.square().sum(1) / n[:, 0]).clamp_min(FLAT) * (S.square().sum(1) / n[:, 0]).clamp_min(FLAT)
-        known = w.mean(1)
-        score = (T * S).sum(1) / n[:, 0] * scale.rsqrt() * known.sqrt()
-        return torch.where(known > self.how.known, score, -1.0), known
+        return compared(S, level.strength[place], level.known[place], self.how.known)
 
 
 def orientations(degrees: float) -> Tensor:

@@ -218,7 +218,8 @@ class Globe:
     def rate(self, rows: slice = slice(None)) -> Tensor:
         """Votes per px of motion along the direction of most motion: [H, W], or some rows of it, in whole cells."""
         cells = slice(*(None if i is None else i // CELL for i in (rows.start, rows.stop)))
-        return self.layers.votes[rows] * spread(1 / self.layers.most[cells].clamp_min(self.texture.least))
+        most = self.layers.most[cells]
+        return self.layers.votes[rows] * spread((most > 0) / most.clamp_min(self.texture.least))
 
     def strength(self) -> Tensor:
         """The rate, saturated, in 0..1: [H, W]."""

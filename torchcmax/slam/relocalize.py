@@ -304,12 +304,20 @@ def judged(glimpse: Glimpse, grid: Grid, state: State, sigma: float = SHARP) -> 
     ahead = (there[:, 2] > NEAREST) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
     place = torch.where(ahead, row * width + column, 0.0).long()
     w, T = grid.known.view(-1)[place] * ahead, grid.chart(sigma).texture.view(-1)[place]
+    return compared(S, T, w, grid.how.known)
+
+
+def compared(S: Tensor, T: Tensor, w: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Scores [K] of a window's strength S [N] and the map's T [K, N] where that is known, w [K, N]; and the share known [K].
+
+    Their correlation times the root of that share; -1 where less than `least` is known.
+    """
     n = w.sum(1, keepdim=True).clamp_min(1)
     T, S = (T - (T * w).sum(1, keepdim=True) / n) * w, (S - (S * w).sum(1, keepdim=True) / n) * w
     scale = (T.square().sum(1) / n[:, 0]).clamp_min(FLAT) * (S.square().sum(1) / n[:, 0]).clamp_min(FLAT)
     known = w.mean(1)
     score = (T * S).sum(1) / n[:, 0] * scale.rsqrt() * known.sqrt()
-    return torch.where(known > grid.how.known, score, -1.0), known
+    return torch.where(known > least, score, -1.0), known
 
 
 def seen_at(grid: Grid, state: State) -> Tensor:

@@ -38,7 +38,7 @@ class System:
             if abs(m.focal - self.canvas.focal) > SAME * m.focal:
                 raise ValueError(f"the map wants the sensor that drew it: focal length {m.focal:.2f} px, not {self.canvas.focal:.2f} px")
             if not m.keyframes:
-                raise ValueError("the given map has no keyframe from which its plane could be seen")
+                raise ValueError("the given map has no keyframe, and nothing of it could be seen")
         given: Sequence[World | None] = maps or [None] * len(cameras)
         self.beside = ThreadPoolExecutor(1, "torchcmax-sight")
         kind = PanoramaRun if isinstance(self.options, Panorama) else Run
