@@ -227,26 +227,33 @@ def _settings(config: Namespace, options: Any, names: tuple[str, ...] = ()) -> s
 
 def run_track(config: Namespace) -> int:
     """torchcmax track"""
-    slam, out = _dataclass(Slam, config), _folder(config.out)
+    slam = _dataclass(Slam, config)
     with usage():
         options = TrackOptions(slam, config["from"], config.to, config.distance, config.map, config.device)
-    recording = _running(config, partial(load_tracking, slam))
+    return _follow(config, options, TrackReport, ("from", "to", "distance", "map", "device"))
+
+
+def run_panorama(config: Namespace) -> int:
+    """torchcmax panorama"""
+    slam = _dataclass(Panorama, config)
+    with usage():
+        options = TrackOptions(slam, config["from"], config.to, None, config.map, config.device)
+    return _follow(config, options, PanoramaReport, ("from", "to", "map", "device"))
+
+
+def _follow(config: Namespace, options: TrackOptions, kind: type[TrackReport], names: tuple[str, ...]) -> int:
+    """Through the whole recording; names: of the options beside those of the tracking that make the same run again."""
+    out = _folder(config.out)
+    recording = _running(config, partial(load_tracking, options.slam))
     tracks = track(recording, options)
-    text = _settings(config, slam, ("from", "to", "distance", "map", "device"))
-    with tracks.stream, TrackReport(out, tracks, text, config.images) as report, Progress(tracks, report, config.quiet) as bar:
+    text = _settings(config, options.slam, names)
+    with tracks.stream, kind(out, tracks, text, config.images) as report, Progress(tracks, report, config.quiet) as bar:
         for one in tracks:
             report.add(one)
             bar.update()
-    _say_where(report, "map: map.png")
+    shown = [out / name for name in report.names if name in report.files and Path(name).suffix in (".txt", ".png")]
+    print("\n".join([told(report), *(f"{path.stem}: {path}" for path in shown), f"curves: tensorboard --logdir {out}"]))
     return 0
-
-
-def _say_where(report: TrackReport, picture: str) -> None:
-    """How it went, and where to look; picture: what it shows, and its file."""
-    shown, name = picture.split(": ")
-    lines = [told(report)]
-    lines += [f"{what}: {report.folder / file}" for what, file in (("trajectory", "trajectory.txt"), (shown, name)) if file in report.files]
-    print("\n".join([*lines, f"curves: tensorboard --logdir {report.folder}"]))
 
 
 def told(report: TrackReport) -> str:
@@ -261,22 +268,6 @@ def told(report: TrackReport) -> str:
     parts = [] if error["percent_of_distance"] is None else [f"{error['percent_of_distance']:.3f} % of the plane's distance"]
     parts += [f"{error['orientation_rmse_deg']:.3f} degrees", f"coverage {error['coverage']:.3f}"]
     return f"{words}\nerror: {', '.join(parts)}"
-
-
-def run_panorama(config: Namespace) -> int:
-    """torchcmax panorama"""
-    slam, out = _dataclass(Panorama, config), _folder(config.out)
-    with usage():
-        options = TrackOptions(slam, config["from"], config.to, None, config.map, config.device)
-    recording = _running(config, partial(load_tracking, slam))
-    tracks = track(recording, options)
-    text = _settings(config, slam, ("from", "to", "map", "device"))
-    with tracks.stream, PanoramaReport(out, tracks, text, config.images) as report, Progress(tracks, report, config.quiet) as bar:
-        for one in tracks:
-            report.add(one)
-            bar.update()
-    _say_where(report, "panorama: panorama.png")
-    return 0
 
 
 class Progress:

@@ -42,7 +42,8 @@ def save_map(path: Path | str, m: Map | Globe) -> None:
     """Writes a map or a panorama with its keyframes, under another name until it is whole; `load_map` gives the same, bit for bit."""
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    tensors = [getattr(part, name) for part in (m.tiles.values() if isinstance(m, Map) else [m.layers] * 2) for name in LAYERS]
+    tensors = [getattr(part, name) for part in (m.tiles.values() if isinstance(m, Map) else [m.layers]) for name in LAYERS]
+    tensors += [] if isinstance(m, Map) else [m.layers.votes] * 2  # texture and weight are as large
     tensors += [getattr(k.ink, name) for k in m.keyframes for name in INK]
     try:
         if shutil.disk_usage(path.parent).free < sum(t.nbytes for t in tensors) + SPARE:

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchcmax.core import so3
@@ -33,13 +32,8 @@ class PanoramaReport(TrackReport):
 
     def _turns(self) -> Tensor:
         """Orientations [M, 3, 3] of the windows on the main map, so far."""
-        number = self.tracks.map.number
-        here = [[line[name] for name in POSE[3:]] for line in self.table if line["map"] == number and line["status"] != "lost"]
-        turns = torch.tensor(here, dtype=torch.float64).view(-1, 4)
+        turns = self._here(POSE[3:])
         return so3.from_quaternion(turns[turns.isfinite().all(-1)])
-
-    def _title(self) -> str:
-        return f"panorama of {self.tracks.recording.name}, {len(self.tracks.map.keyframes)} keyframes"
 
     def _pages(self) -> dict[str, Callable[[], np.ndarray]]:
         return {"panorama.png": self._page, "panorama_cropped.png": partial(self._page, cropped=True)}

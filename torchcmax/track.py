@@ -140,13 +140,6 @@ def in_metres(trajectory: Trajectory, unit: float) -> Trajectory:
     return Trajectory(trajectory.time, Pose(trajectory.pose.R, trajectory.pose.t * unit))
 
 
-def _brief(slam: Slam | Panorama) -> Slam | Panorama:
-    """With a map that two windows are enough for."""
-    if isinstance(slam, Panorama):
-        return replace(slam, mapping=replace(slam.mapping, first=2))
-    return replace(slam, mapping=replace(slam.mapping, first=2))
-
-
 class _Dots:
     """Windows of dots on a wall that the camera moves along: enough for a system to run."""
 
@@ -178,5 +171,6 @@ def load_kernels(slam: Slam | Panorama, device: str = "cpu") -> None:
     """Track a few windows of dots: what is compiled, or loaded, for this device is there afterwards, and later times are of work."""
     camera = Camera.pinhole((32, 40))
     with suppress(ValueError):  # options that want more than a few dots: they are told of, if they must, on the recording
-        for _ in System([camera], _brief(slam)).run([_Dots(camera, device)]):
+        brief = replace(slam, mapping=replace(slam.mapping, first=2))  # type: ignore[arg-type]  # of its own kind
+        for _ in System([camera], brief).run([_Dots(camera, device)]):
             pass

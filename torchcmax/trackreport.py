@@ -161,13 +161,15 @@ class TrackReport:
         page = self._page(SMALL)
         board.image("map", png(page), page.shape[:2], step)
 
-    def _positions(self) -> Tensor:
+    def _here(self, names: Sequence[str]) -> Tensor:
+        """Some numbers of the windows on the main map, so far: [M, len(names)]."""
         number = self.tracks.map.number
-        here = [[line[name] for name in POSE[:3]] for line in self.table if line["map"] == number and line["status"] != "lost"]
-        return torch.tensor(here, dtype=torch.float64).view(-1, 3)
+        here = [[line[name] for name in names] for line in self.table if line["map"] == number and line["status"] != "lost"]
+        return torch.tensor(here, dtype=torch.float64).view(-1, len(names))
 
     def _title(self) -> str:
-        return f"map of {self.tracks.recording.name}, {len(self.tracks.map.keyframes)} keyframes"
+        stem = self.names[-1].removesuffix(".h5")
+        return f"{stem} of {self.tracks.recording.name}, {len(self.tracks.map.keyframes)} keyframes"
 
     def __enter__(self) -> TrackReport:
         return self
@@ -250,7 +252,7 @@ class TrackReport:
     def _page(self, most: int = LARGEST) -> np.ndarray:
         """The map, no side longer than `most` px."""
         assert isinstance(self.tracks.map, Map)
-        return picture(self.tracks.map, self._positions(), self._title(), self.tracks.options.distance, most)
+        return picture(self.tracks.map, self._here(POSE[:3]), self._title(), self.tracks.options.distance, most)
 
     def _world(self) -> dict[str, Any]:
         """What the summary says of the map."""

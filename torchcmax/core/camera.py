@@ -191,9 +191,12 @@ class Sphere:
 
     def pixels(self, ray: Tensor) -> Tensor:
         """Directions to image points: ray [..., 3] -> [..., 2] px, the columns from -0.5 to W - 0.5."""
-        x, y, z = ray.unbind(-1)
-        around = (x * x + z * z).sqrt()
-        return torch.stack([torch.atan2(x, z), torch.atan2(y, around)], -1) * self.focal + ray.new_tensor(self.centre)
+        return torch.stack(self.place(*ray.unbind(-1)), -1)
+
+    def place(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Column and row of directions, px, as `pixels`, from their parts."""
+        column, row = torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())
+        return column * self.focal + self.centre[0], row * self.focal + self.centre[1]
 
     def folded(self, image: Tensor) -> Tensor:
         """Votes beyond a seam belong to its other side, those beyond a pole half way round: [A, H + 2, W + 2] -> [A, H, W]."""

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchcmax import kernels
 from torchcmax.core import so3
-from torchcmax.core.match import NUMBERS, Matching, match, units
+from torchcmax.core.match import Matching, match, units
 from torchcmax.core.state import SIZE
 from torchcmax.slam.globe import Facet, Globe
 from torchcmax.slam.map import Area
 from torchcmax.slam.mapper import WORSE, before, met
+from torchcmax.slam.tracker import basis_of
 
 JUDGES = 6  # keyframes that say whether a round has made the map better
 STEADY = 0.02  # share of its information by which a keyframe stays where it is
@@ -62,8 +63,8 @@ def settled(globe: Globe, matching: Matching, last: int | None = None) -> Globe:
         keyframes[i] = keyframes[i].at(keyframes[i].state.moved(step))
     fresh = Globe(globe.focal, globe.border, globe.texture, number=globe.number)
     fresh.draw(keyframes)
-    before = sum(wishes[i].met for i in judges if i in wishes) / len(judges)
-    if agreed(fresh, judges, matching, globe.typical()) < WORSE * before:
+    agreed_before = sum(wishes[i].met for i in judges if i in wishes) / len(judges)
+    if agreed(fresh, judges, matching, globe.typical()) < WORSE * agreed_before:
         return globe
     return fresh
 
@@ -112,11 +113,11 @@ def wanted(globe: Globe, numbers: list[int], matching: Matching, judges: list[in
 
 
 def _wish(globe: Globe, number: int, typical: float, matching: Matching, asked: bool) -> Wish | None:
-    found, keyframe, eye = among_others(globe, number, typical), globe.keyframes[number], torch.eye(NUMBERS, dtype=torch.float64)
+    found, keyframe = among_others(globe, number, typical), globe.keyframes[number]
     if found is None:
         return None
     facet = found[0]
-    task = before(facet, keyframe, *found[1:], matching, torch.cat([eye[:, TURN], eye[:, RATE]], 1))
+    task = before(facet, keyframe, *found[1:], matching, basis_of("rotation", "full"))
     if task is None:
         return None
     one = match(torch.zeros(1, 6, dtype=torch.float64), task, matching)
@@ -127,25 +128,17 @@ def _wish(globe: Globe, number: int, typical: float, matching: Matching, asked: 
 
 
 def together(globe: Globe, wishes: dict[int, Wish]) -> dict[int, Tensor]:
-    """The turns of all keyframes, rad in their cameras' frames, that fulfil their wishes best, together."""
-    index = {i: k for k, i in enumerate(sorted(wishes))}
+    """The turns of all keyframes, rad in their cameras' frames, that fulfil their wishes best, together; others stay."""
+    numbers = sorted(wishes)
     R = torch.cat([k.state.pose.R for k in globe.keyframes])
-    axes = R[:, :, 2]
-    n = len(index)
-    B, z = torch.zeros(n, 3, n, 3, dtype=torch.float64), torch.zeros(n, 3, dtype=torch.float64)
-    stays = torch.zeros(n, 3, n, 3, dtype=torch.float64)
-    for i, k in index.items():
-        apart = (axes @ axes[i]).clamp(-1, 1).arccos()
-        weight = (1 - apart / globe.field_of_view).clamp_min(0).square()
-        weight[i] = 0
-        weight = weight / weight.sum().clamp_min(1e-9)
-        L = torch.linalg.cholesky(wishes[i].information).mT @ R[i].mT  # in its own frame, of a turn in the world's
-        B[k, :, k] += L
-        for j in weight.nonzero()[:, 0].tolist():
-            if j in index:
-                B[k, :, index[j]] -= weight[j] * L
-        z[k] = torch.linalg.cholesky(wishes[i].information).mT @ wishes[i].turn
-        stays[k, :, k] = STEADY**0.5 * L
-    A = torch.cat([B.view(3 * n, 3 * n), stays.view(3 * n, 3 * n)])
-    theta = torch.linalg.solve(A.mT @ A, A.mT @ torch.cat([z.flatten(), torch.zeros(3 * n, dtype=torch.float64)])).view(n, 3)
-    return {i: R[i].mT @ theta[k] for i, k in index.items()}
+    apart = (R[numbers, :, 2] @ R[:, :, 2].mT).clamp(-1, 1).arccos()
+    weight = (1 - apart / globe.field_of_view).clamp_min(0).square()
+    weight[range(len(numbers)), numbers] = 0
+    weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
+    own = torch.eye(len(numbers), dtype=torch.float64)
+    root = torch.linalg.cholesky(torch.stack([wishes[i].information for i in numbers])).mT
+    L = root @ R[numbers].mT  # of a turn in the world's frame
+    wish, stay = (torch.einsum("iab,ij->iajb", L, D).flatten(2).flatten(0, 1) for D in (own - weight[:, numbers], STEADY**0.5 * own))
+    z = (root @ torch.stack([wishes[i].turn for i in numbers])[..., None]).flatten()
+    theta = torch.linalg.solve(wish.mT @ wish + stay.mT @ stay, wish.mT @ z).view(-1, 3)
+    return {i: R[i].mT @ turn for i, turn in zip(numbers, theta, strict=True)}

@@ -16,15 +16,14 @@ from torch import Tensor
 from torchcmax import kernels
 from torchcmax.core import so3
 from torchcmax.core.camera import Sphere
-from torchcmax.core.draw import Ink
-from torchcmax.core.match import NUMBERS, Matching, Task, loosely, match
+from torchcmax.core.match import Matching, Task, loosely, match
 from torchcmax.core.pose import Motion, Pose
 from torchcmax.core.state import State
 from torchcmax.slam.equirect import smooth
 from torchcmax.slam.glimpse import Glimpse
 from torchcmax.slam.globe import WALL, Globe
-from torchcmax.slam.relocalize import SHARP, Found, Seeking, compared
-from torchcmax.slam.tracker import SOME
+from torchcmax.slam.relocalize import SHARP, Found, Seeking, chosen, compared
+from torchcmax.slam.tracker import SOME, basis_of
 
 BLUR = 0.4  # of the distance between two orientations that are tried, the blur of map and window
 AT_ONCE = 1 << 21  # points looked up at a time
@@ -135,11 +134,9 @@ class Compass:
         box = facet.box(facet.warp(state, glimpse.seconds))
         if box is None:
             return state
-        eye = torch.eye(NUMBERS, dtype=torch.float64)
-        basis, prior = torch.cat([eye[:, :3], eye[:, 6:9]], 1), loosely(*LOOSE)[None]
+        basis, prior = basis_of("rotation", "full"), loosely(*LOOSE)[None]
         for chart in facet.area(box).charts:
-            ink: Ink = glimpse.ink
-            task = Task(state, WALL, glimpse.seconds, chart, ink, ink.sample(SOME), prior, basis)
+            task = Task(state, WALL, glimpse.seconds, chart, glimpse.ink, glimpse.ink.sample(SOME), prior, basis)
             state = match(torch.zeros(1, 6, dtype=torch.float64), task, Matching(every=1)).state
         return state
 
@@ -156,10 +153,8 @@ class Compass:
 
     def _correlated(self, ray: Tensor, S: Tensor, R: Tensor, level: Level) -> tuple[Tensor, Tensor]:
         height, width = level.sphere.size
-        x, y, z = (R @ ray).unbind(1)  # [K, N] each
-        column = (torch.atan2(x, z) * level.sphere.focal + level.sphere.centre[0]).round().long() % width
-        row = (torch.atan2(y, (x * x + z * z).sqrt()) * level.sphere.focal + level.sphere.centre[1]).round().long().clamp(0, height - 1)
-        place = row * width + column
+        column, row = (part.round().long() for part in level.sphere.place(*(R @ ray).unbind(1)))  # [K, N] each
+        place = row.clamp(0, height - 1) * width + column % width
         return compared(S, level.strength[place], level.known[place], self.how.known)
 
 
@@ -188,9 +183,4 @@ def distinct(R: Tensor, score: Tensor, keep: int, apart: float) -> Tensor:
     flat = R[order].flatten(1)
     trace = flat @ flat.mT
     other = trace < 1 + 2 * math.cos(apart)
-    alive, kept = torch.ones(len(order), dtype=torch.bool), list[int]()
-    for i in range(len(order)):
-        if alive[i] and len(kept) < keep:
-            kept.append(i)
-            alive &= other[i]
-    return order[torch.tensor(kept)]
+    return order[chosen(other, keep)]

@@ -42,12 +42,10 @@ def tangents(ray: Tensor) -> Tensor:
     return torch.stack([east, torch.stack([-y * x / flat, flat, -y * z / flat], -1)], -2)
 
 
-def grid_at(ray: tuple[Tensor, ...], sphere: Sphere) -> Tensor:
+def grid_at(ray: tuple[Tensor, Tensor, Tensor], sphere: Sphere) -> Tensor:
     """Where rays x, y, z [h, w] are on a `bordered` image, as grid_sample wants it: [1, h, w, 2] in -1..1."""
-    x, y, z = ray
-    angles = torch.atan2(x, z), torch.atan2(y, torch.addcmul(x * x, z, z).sqrt_())
-    parts = zip(angles, sphere.centre, (sphere.size[1] + 1, sphere.size[0] + 1), strict=True)
-    return torch.stack([angle * (2 * sphere.focal / size) + (2 * (centre + 1) / size - 1) for angle, centre, size in parts], -1)[None]
+    parts = zip(sphere.place(*ray), sphere.size[::-1], strict=True)
+    return torch.stack([(place + 1) * (2 / (size + 1)) - 1 for place, size in parts], -1)[None]
 
 
 def bordered(image: Tensor, sphere: Sphere) -> Tensor:

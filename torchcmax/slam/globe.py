@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from torchcmax.core.camera import Sphere
-from torchcmax.core.draw import Ink, draw_sum
+from torchcmax.core.draw import draw_sum
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose
-from torchcmax.core.state import State
 from torchcmax.slam.equirect import bordered, cosines, directions, grid_at, steady, tangents
 from torchcmax.slam.map import MARGIN, Keyframe, Map, Texture
 from torchcmax.slam.tiles import CELL, TILE, Box, Layers, at, spread
@@ -24,21 +23,20 @@ from torchcmax.slam.tiles import CELL, TILE, Box, Layers, at, spread
 SPACING = 15.0  # degrees from the middle of a facet up to which a camera is tracked on it
 WIDEST = 75.0  # degrees from the middle of a facet beyond which there is nothing on it: it is four times as long there as on the sphere
 KEPT = 8  # facets that are kept
-PIECE = 32  # keyframes that are drawn at a time
 AHEAD = 0.05  # least z of a unit ray that a camera sees
 WALL = Plane.tilted(torch.zeros(1, 2, dtype=torch.float64))
 """Any plane at distance one: what a camera that only turns sees does not depend on it."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Facet(Map):
     """A plane that touches the sphere, with what the globe shows there: the map of a plane for a camera that only turns.
 
     turn [1, 3, 3]: of a camera that looks straight at it | globe: layers are taken from there, and kept in no tiles
     """
 
-    turn: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64)[None])
-    globe: Globe = field(default_factory=lambda: Globe(1.0, torch.zeros(1, 3)), repr=False)
+    turn: Tensor
+    globe: Globe = field(repr=False)
     _kept: tuple[Box, tuple[Tensor, Tensor, Tensor]] | None = field(default=None, repr=False)
 
     @cached_property
@@ -87,27 +85,20 @@ class Facet(Map):
             self._kept = box, places
         return self._kept[1]
 
-    def _world(self, box: Box, cell: int, R: Tensor) -> tuple[Tensor, ...]:
+    def _world(self, box: Box, cell: int, R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """x, y and z [h, w] of the rays of the middles of its squares of `cell` px, not of unit length."""
         x, y = (
             (torch.arange(n // cell, dtype=torch.float32) * cell + (cell - 1) / 2 + first) / self.focal
             for n, first in zip(box.size[::-1], box.corner, strict=True)
         )
-        return tuple(torch.add(row[0] * x, (row[1] * y + row[2])[:, None]) for row in R)
+        first, second, third = (torch.add(row[0] * x, (row[1] * y + row[2])[:, None]) for row in R)
+        return first, second, third
 
 
-def steps(world: tuple[Tensor, ...], R: Tensor) -> Tensor:
+def steps(world: tuple[Tensor, Tensor, Tensor], R: Tensor) -> Tensor:
     """How steps along x and y of a facet are steps east and south, but for their length: at rays (x, y, z) [h, w] -> [h, w, 2, 2]."""
-    x, y, z = world
-    long = (x * x + y * y + z * z).rsqrt()
-    x, y, z = x * long, y * long, z * long
-    flat = (x * x + z * z).rsqrt().clamp_max(1e9)
-    rows = []
-    for a, b, c in ((z * flat, None, -x * flat), (-y * x * flat, 1 / flat, -y * z * flat)):  # east, south: they are across the ray
-        rows += [a * R[0, i] + c * R[2, i] + (0 if b is None else b * R[1, i]) for i in (0, 1)]
-    A: Tensor = torch.stack(rows, -1)
-    A = A * (A.square().sum(-1, keepdim=True) / 2).rsqrt()
-    found: Tensor = A.unflatten(-1, (2, 2))
+    A = tangents(torch.nn.functional.normalize(torch.stack(world, -1), dim=-1)) @ R[:, :2]  # east and south are across the ray
+    found: Tensor = A / (A.square().sum((-1, -2), keepdim=True) / 2).sqrt()
     return found
 
 
@@ -161,17 +152,14 @@ class Globe:
             facet._area = None
 
     def layers_of(self, keyframes: Sequence[Keyframe]) -> Layers:
-        """What windows add."""
+        """What windows add; each where it is exposed, as a map's do."""
         votes, exposure = torch.zeros_like(self.layers.votes), torch.zeros_like(self.layers.exposure)
-        for first in range(0, len(keyframes), PIECE):
-            part = keyframes[first : first + PIECE]
-            state, seconds = State.join([k.state for k in part]), torch.cat([k.seconds for k in part])
-            spin = state.motion.omega * seconds[:, None]
-            ink = Ink.join([k.ink for k in part])
-            ink = Ink(ink.x, ink.y, ink.s, ink.weight * (spin.norm(dim=-1, keepdim=True) > 0))  # a window at rest shows no edges
-            votes += draw_sum(state.homography(WALL.repeated(len(part)), seconds).to(ink.x), ink, self.sphere)[0]
-            for R, w in zip(state.pose.R.float(), spin.float(), strict=True):
-                self._expose(exposure.view(3, -1), R, w)
+        for k in keyframes:
+            own = torch.zeros_like(exposure)
+            self._expose(own.view(3, -1), k.state.pose.R[0].float(), (k.state.motion.omega * k.seconds[:, None])[0].float())
+            image = draw_sum(k.state.homography(WALL, k.seconds).to(k.ink.x), k.ink, self.sphere)[0]
+            votes += image.mul_(spread((own[0] + own[2] > 0).to(image)))
+            exposure += own
         return Layers(steady(votes, self.sphere) / cosines(self.sphere), exposure)
 
     def _expose(self, exposure: Tensor, R: Tensor, spin: Tensor) -> None:
@@ -218,8 +206,7 @@ class Globe:
     def rate(self, rows: slice = slice(None)) -> Tensor:
         """Votes per px of motion along the direction of most motion: [H, W], or some rows of it, in whole cells."""
         cells = slice(*(None if i is None else i // CELL for i in (rows.start, rows.stop)))
-        most = self.layers.most[cells]
-        return self.layers.votes[rows] * spread((most > 0) / most.clamp_min(self.texture.least))
+        return self.layers.votes[rows] * spread(1 / self.layers.most[cells].clamp_min(self.texture.least))
 
     def strength(self) -> Tensor:
         """The rate, saturated, in 0..1: [H, W]."""

@@ -40,9 +40,9 @@ class Track:
     """What became of one window.
 
     recording, index: which it is | window [1, N] | time µs of its middle | state [1] there, in the world of `map`; of a lost camera
-    where it was last | normal [1, 3] of the plane, in the camera's frame | contrast_zero, contrast: at rest and with its motion
-    status, and the reason where it is not ok | keyframe: the one its pose hangs on, -1 where it is lost | drawn: whether it became that
-    keyframe | map: as it is now, and goes on changing; of a lost camera the one that it was on last
+    where it was last | normal [1, 3] of the plane, in the camera's frame, nan where there is none | contrast_zero, contrast: at rest
+    and with its motion | status, and the reason where it is not ok | keyframe: the one its pose hangs on, -1 where it is lost
+    drawn: whether it became that keyframe | map: as it is now, and goes on changing; of a lost camera the one that it was on last
     """
 
     recording: int

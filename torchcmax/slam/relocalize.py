@@ -331,9 +331,14 @@ def distinct(grid: Grid, state: State, score: Tensor, keep: int) -> Tensor:
     order = score.argsort(descending=True)
     xy = seen_at(grid, state)[order]
     other = (xy[:, None] - xy[None]).square().sum(-1).mean(-1) > APART**2
-    alive, kept = torch.ones(len(order), dtype=torch.bool), list[int]()
-    for i in range(len(order)):
+    return order[chosen(other, keep)]
+
+
+def chosen(other: Tensor, keep: int) -> Tensor:
+    """Of things in order, the first, then the next that is another one than all chosen before, at most `keep`: other [K, K] -> indices."""
+    alive, kept = torch.ones(len(other), dtype=torch.bool), list[int]()
+    for i in range(len(other)):
         if alive[i] and len(kept) < keep:
             kept.append(i)
             alive &= other[i]
-    return order[torch.tensor(kept)]
+    return torch.tensor(kept, dtype=torch.int64)

@@ -27,11 +27,26 @@ from torchcmax.slam.record import ALONG, FEW, GAP, NOISE, UNSURE, Placement, Sig
 from torchcmax.slam.relocalize import Grid
 from torchcmax.slam.seek import Searchable, Searching, Seeker
 from torchcmax.slam.sense import decided, name_of
-from torchcmax.slam.tracker import Belief, Front, Sight, Step, World, basis_of, before_plane, covariance_of, doubt, front, rays_of, step
+from torchcmax.slam.tracker import (
+    Belief,
+    Front,
+    Sight,
+    Step,
+    World,
+    basis_of,
+    before_plane,
+    covariance_of,
+    doubt,
+    front,
+    rays_of,
+    speed,
+    step,
+)
 from torchcmax.slam.windows import Seen, Source, Windows
 
 FIRST_SIGMA = 0.005, 0.005, 0.2, 0.2  # of the last start window: turn, shift, angular velocity, velocity
 FOUND_SIGMA = 0.01, 0.01, 0.3, 0.3  # of a camera that was found near
+RESTING, ADRIFT = 0.1, 4.0  # s in which a camera can come to rest, and px that it could go in them before it is asked where it is
 REST = 0.05  # rad/s and distances/s that a still camera may move, one sigma
 BORDER = 4  # px from one ray of the sensor's edge to the next
 LEAST = 0.5  # share of the first windows that are enough where the camera comes to rest
@@ -77,6 +92,7 @@ class Run:
         self.grid: tuple[World, int, Searchable] | None = None
         self.weak_since: int | None = None  # µs, of windows that met few edges; and of those of which it was unsure where
         self.unsure_since: int | None = None
+        self.adrift: int | None = None  # µs, since when it may have gone on where there was only noise
         self.index = self.losses = self.recoveries = self.joins = 0
 
     # windows
@@ -151,12 +167,14 @@ class Run:
         keyframes = self.site.map.keyframes
         for i, g in enumerate(gathered):
             self.placements[g.number].hang(self.site, i, keyframes[i].state, "start")
-        first, last = still(keyframes[0].state.later(-keyframes[0].seconds / 2).pose), still(keyframes[-1].state.pose)
+        first = still(keyframes[0].state.later(-keyframes[0].seconds / 2).pose)
+        last = still(keyframes[-1].state.later(keyframes[-1].seconds / 2).pose)
         for number, placement in enumerate(self.placements):  # at rest until it began to move, or from then on
             if placement.site is None and placement.status == "still":
                 before = number < gathered[0].number
                 placement.hang(self.site, 0 if before else len(keyframes) - 1, first if before else last, "still")
-        self.belief = Belief(torch.tensor([keyframes[-1].time]), keyframes[-1].state, covariance_of(FIRST_SIGMA))
+        rests = gathered[-1].number < len(self.placements) - 1  # only noise came behind them
+        self.belief = Belief(torch.tensor([keyframes[-1].time]), last if rests else keyframes[-1].state, covariance_of(FIRST_SIGMA))
         self._anew(self.site)
         yield from self._early_tracks()
 
@@ -177,8 +195,10 @@ class Run:
         return self._track(seen, Placement(seen.time, "lost", site), Signs(seen.supported, 0.0, 0.0), reason, alone, state=state)
 
     def lose(self) -> None:
-        """From now on nothing is believed of where the camera is, nor of the windows in which it met few edges, or was unsure, before."""
+        """From now on nothing is believed of where the camera is, nor of the windows before in which it met few edges, or was unsure, or
+        seemed to be at rest."""
         since = self.unsure_since if self.weak_since is None else self.weak_since
+        since = self.adrift if self.adrift is not None else since
         for placement in self.placements[::-1]:
             if since is None or placement.time < since:
                 break
@@ -219,6 +239,7 @@ class Run:
         """From now on the camera is here, and nothing is held against it."""
         self.site, self.last, self.gathered, self.motion = site, site or self.last, [], None
         self.weak_since = self.unsure_since = None
+        self.adrift = None
 
     def _trace(self, home: Site, now: Belief) -> None:
         """The windows before a camera was found, the last one first, as long as they fit."""
@@ -269,8 +290,14 @@ class Run:
         return Sight.of(site.map, belief.state, window.duration.double())
 
     def hold(self, site: Site, seen: Seen) -> Track:
-        """A window of noise: the camera stays where it was."""
-        state, covariance = still(self._belief.state.pose), self._belief.covariance.clone()
+        """A window of noise: the camera stays where it was.
+
+        If it was moving, it may be the view that has nothing: the next window must fit there as a found place would.
+        """
+        if self.adrift is None and speed(self._belief.state, site.map.plane, self.rays, self.canvas.focal) * RESTING > ADRIFT:
+            self.adrift = seen.time
+        last = self._belief.at(seen.window.start, self.options.tracking.acceleration)  # where it was when the noise began
+        state, covariance = still(last.state.pose), last.covariance.clone()
         covariance[:, 6:] = covariance[:, :, 6:] = 0
         covariance[:, range(6, 12), range(6, 12)] = REST**2
         self.belief = Belief(seen.window.middle, state, covariance)
@@ -286,7 +313,9 @@ class Run:
         self.belief, strength = found.after[row : row + 1], float(found.match.strength[row])
         tells = self.options.tracking.matching.objective == "lookup"  # how sure it is
         unsure = doubt(self.belief, site.map.plane, self.rays, self.canvas.focal) if tells else float("nan")
-        status, reason = self._status(site, strength, unsure, seen.time)
+        fits = self.adrift is None or self._fits(site, seen.window)
+        status, reason = self._status(site, strength if fits else 0.0, unsure, seen.time)
+        self.adrift = None if status == "ok" else self.adrift
         if reason == FEW:  # keep to what was predicted, or to where it is found near, which is believed when the next window fits there
             self.belief = self._near(site, seen.window, found, row) or found.before[row : row + 1]
         sight = self._refined(site, seen.window, before, reason)
@@ -305,6 +334,13 @@ class Run:
         if status == "ok":
             motion, there = before_plane(self._belief.state, site.map.plane)
             self._seek(seen.window, motion, there.normal)
+
+    def _fits(self, site: Site, window: Window) -> bool:
+        """Whether a window looks as the map does where the camera is believed to be."""
+        state = self._belief.state
+        motion, there = before_plane(state, site.map.plane)
+        glimpse = Glimpse.of(window, motion, there.normal, self.sensor, self.border)
+        return self._grid(site).judge(glimpse, state) >= self.options.relocalizing.accept
 
     def _status(self, site: Site, strength: float, unsure: float, time: int) -> tuple[Status, str]:
         """Of a window that was tracked, and why it is not ok."""
@@ -383,7 +419,7 @@ class Run:
         """A map of what there is, where there is none, then all keyframes once more."""
         if not self.sites:
             if len(self.gathered) < min(self.least, self.options.mapping.first):
-                few = f"{len(self.gathered)} windows that show motion, at least {self.least} {'are' if self.least > 1 else 'is'} wanted"
+                few = f"{len(self.gathered)} windows that show motion, it wants at least {self.least}"
                 raise TooShort(f"recording {self.number} holds too few events to begin: {few}")
             yield from self._begin()
         yield from self._early_tracks()

@@ -40,7 +40,6 @@ class System:
             if not m.keyframes:
                 raise ValueError("the given map has no keyframe, and nothing of it could be seen")
         given: Sequence[World | None] = maps or [None] * len(cameras)
-        self.beside = ThreadPoolExecutor(1, "torchcmax-sight")
         kind = PanoramaRun if isinstance(self.options, Panorama) else Run
         self.runs = [kind(i, camera, self.canvas, self.options, m) for i, (camera, m) in enumerate(zip(cameras, given, strict=True))]
 
@@ -65,32 +64,35 @@ class System:
         """The windows of every recording, side by side, to the end of the longest; then all keyframes are optimized once more."""
         for run, source in zip(self.runs, sources, strict=True):
             run.begin(source)
-        while turn := [(run, seen) for run in self.runs if (seen := run.next()) is not None]:
-            tasks: list[_Task] = []
-            for run, seen in turn:
-                if seen.gap and run.site is not None:
-                    run.lose()
-                if (site := run.site) is None:
-                    yield from run.wander(seen)
-                elif seen.noise:
-                    yield run.hold(site, seen)
-                else:
-                    tasks.append((run, site, seen, run.predicted(seen.window)))
-            if tasks:
-                yield from self._step(tasks)
+        with ThreadPoolExecutor(1, "torchcmax-sight") as beside:
+            while turn := [(run, seen) for run in self.runs if (seen := run.next()) is not None]:
+                tasks: list[_Task] = []
+                for run, seen in turn:
+                    if seen.gap and run.site is not None:
+                        run.lose()
+                    if (site := run.site) is None:
+                        yield from run.wander(seen)
+                    elif seen.noise:
+                        yield run.hold(site, seen)
+                    else:
+                        tasks.append((run, site, seen, run.predicted(seen.window)))
+                if tasks:
+                    yield from self._step(tasks, beside)
         for run in self.runs:
             yield from run.finish()
 
-    def _step(self, tasks: Sequence[_Task]) -> Iterator[Track]:
+    def _step(self, tasks: Sequence[_Task], beside: ThreadPoolExecutor) -> Iterator[Track]:
         """Windows on their maps.  What they see there is looked up beside the search for what they show alone."""
-        sights = [self.beside.submit(run.sight, site, seen.window, before) for run, site, seen, before in tasks]
+        sights = [beside.submit(run.sight, site, seen.window, before) for run, site, seen, before in tasks]
         windows, before = Window.join([task[2].window for task in tasks]), Belief.join([task[3] for task in tasks])
         plane, (how, model) = Plane.join([task[1].map.plane for task in tasks]), (self.options.tracking, self.options.model)
         alone = front(windows, self.canvas, before.state, plane, how, model)
         seeing = {i: sight for i, future in enumerate(sights) if (sight := future.result()) is not None}
-        rows = torch.tensor(list(seeing), dtype=torch.int64)
+        if 0 < len(seeing) < len(tasks):
+            rows = torch.tensor(list(seeing))
+            windows, before, alone = windows[rows], before[rows], alone[rows]
         if seeing:
-            found = step(windows[rows], self.canvas, before[rows], list(seeing.values()), how, model, alone[rows])
+            found = step(windows, self.canvas, before, list(seeing.values()), how, model, alone)
         order = {i: row for row, i in enumerate(seeing)}
         for i, (run, site, seen, _) in enumerate(tasks):
             yield from run.follow(site, seen, found, order[i], seeing[i]) if i in order else run.blind(seen)
