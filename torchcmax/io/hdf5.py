@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
 from torchcmax.io.calibration import Lens, told_lens
+from torchcmax.io.contents import Contents
 from torchcmax.io.errors import DataError
 from torchcmax.io.events import LATEST, Events
 from torchcmax.io.recording import Recording
@@ -33,19 +34,6 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF5 crashes the process when it finds it full
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a file holds beside the events themselves; the sensor's width and height as they stand there, not checked."""
-
-    count: int | None
-    name: str = ""
-    own: bool = False
-    sensor: tuple[Any, Any] | None = None
-    lens: Lens | None = None
-    truth: Trajectory | None = None
-    plane: Plane | None = None
-
-
 @contextmanager
 def _file(path: Path) -> Iterator[Any]:
     """An HDF5 file to read; what goes wrong with it is a DataError."""
@@ -56,8 +44,8 @@ def _file(path: Path) -> Iterator[Any]:
         raise DataError(path, f"cannot be read as HDF5: {error}", "copy or download it again; it may be cut off or damaged") from error
 
 
-def read_contents(path: Path) -> Contents:
-    """Everything but the events, which are looked at for their kinds and lengths only."""
+def contents(path: Path) -> Contents:
+    """What the file holds; its events are looked at for their kinds and lengths only."""
     with _file(path) as file:
         count = _count(path, file)
         own = file.attrs.get("format") == "torchcmax"
@@ -68,7 +56,8 @@ def read_contents(path: Path) -> Contents:
         sensor = None if sizes is None else (_attribute(sizes["width"]), _attribute(sizes["height"]))
         lens = _lens(path, file if own else file.get("calib"))
         truth, plane = _truth(path, file, "truth" if own else "groundtruth"), _plane(path, file, "plane" if own else "groundtruth/plane")
-        return Contents(count, str(file.attrs.get("name", "")), own, sensor, lens, truth, plane)
+        events, name = partial(read_events, path), str(file.attrs.get("name", ""))
+        return Contents(events, lambda event: f"event {event + 1}", count, name, own, sensor, lens, truth, plane)
 
 
 def _attribute(value: Any) -> Any:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import codecs
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -17,9 +17,10 @@ from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
 from torchcmax.io.calibration import ECD_FORM, Lens, checked_size, guess_sensor, read_lens
 from torchcmax.io.checked import Source, checked
+from torchcmax.io.contents import Contents
 from torchcmax.io.errors import DataError, DataWarning
 from torchcmax.io.events import Events
-from torchcmax.io.hdf5 import Contents, read_contents, read_events
+from torchcmax.io.hdf5 import contents
 from torchcmax.io.member import GZIP, UTF16, Member, image_size, not_a_file, open_zip, reading
 from torchcmax.io.recording import Recording
 from torchcmax.io.text import NUMBER, check_text, line_of, read_text
@@ -93,28 +94,37 @@ def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: s
     """A recording as text, in a folder or a .zip."""
     file = folder / events
     check_text(file)
-    raw = partial(read_text, file, options.chunk)
-    camera, guessed = _camera(folder, Contents(None, sensor=image_size(folder)), str(file), options, raw)
-    source = Source(str(file), camera.size[::-1], partial(line_of, file), options.strict)
-    return Recording(path, name, camera, lambda: checked(raw(), source), None, *_truth(folder), guessed)
+    found = Contents(partial(read_text, file), partial(line_of, file), name=name, sensor=image_size(folder))
+    return _recording(path, str(file), found, options, folder)
 
 
 def _hdf5(path: Path, options: OpenOptions, folder: Path | None = None) -> Recording:
     """A recording in an HDF5 file.  The files of the folder go before what stands in it, unless our own file is opened by itself."""
-    contents = read_contents(path)
-    folder = path.parent if folder is None and not contents.own else folder
-    raw = partial(read_events, path, options.chunk)
-    camera, guessed = _camera(folder, contents, str(path), options, raw)
+    found = contents(path)
+    return _recording(path, str(path), found, options, path.parent if folder is None and not found.own else folder)
+
+
+def _recording(path: Path, file: str, found: Contents, options: OpenOptions, folder: Member | None) -> Recording:
+    """What a file and the files beside it make; the latter go before what stands in the former."""
+    camera, guessed = _camera(folder, found, file, options)
     beside = (None, None) if folder is None else _truth(folder)
-    truth, plane = beside[0] or contents.truth, beside[1] or contents.plane
-    name = contents.name or (path.parent.resolve().name if path.stem == "events" else path.stem)
-    source = Source(str(path), camera.size[::-1], lambda event: f"event {event + 1}", options.strict)
-    return Recording(path, name, camera, lambda: checked(raw(), source), contents.count, truth, plane, guessed)
+    truth, plane = beside[0] or found.truth, beside[1] or found.plane
+    name = found.name or (path.parent.resolve().name if path.stem == "events" else path.stem)
+    source, since = Source(file, camera.size[::-1], found.place, options.strict), found.since
+
+    def chunks() -> Iterator[Events]:
+        return checked(found.events(options.chunk), source)
+
+    def later(time: int) -> tuple[int, Iterator[Events]]:
+        if since is None:
+            return 0, chunks()
+        before, rest = since(time, options.chunk)
+        return before, checked(rest, replace(source, place=lambda event: source.place(before + event)))
+
+    return Recording(path, name, camera, chunks, found.count, truth, plane, guessed, later)
 
 
-def _camera(
-    folder: Member | None, contents: Contents, file: str, options: OpenOptions, raw: Callable[[], Iterator[Events]]
-) -> tuple[Camera, bool]:
+def _camera(folder: Member | None, found: Contents, file: str, options: OpenOptions) -> tuple[Camera, bool]:
     """The camera, and whether its size is guessed.
 
     Its lens is from the options, calib.txt or the file; its size from the options, the lens's file, the file, or the events.
@@ -125,12 +135,12 @@ def _camera(
     elif not options.camera and folder is not None and (folder / "calib.txt").is_file():
         lens = read_lens(folder / "calib.txt")
     elif not options.camera:
-        lens = contents.lens
+        lens = found.lens
         if lens is None:
             remedy = f"put {ECD_FORM} into a file calib.txt beside the events, give --camera FILE, or --camera pinhole [--sensor 240x180]"
             raise DataError(file, "there is no calibration for it", remedy)
-    known = options.sensor or (lens and lens.sensor) or contents.sensor
-    sensor = checked_size(file, *known) if known else guess_sensor(file, lens, raw)
+    known = options.sensor or (lens and lens.sensor) or found.sensor
+    sensor = checked_size(file, *known) if known else guess_sensor(file, lens, partial(found.events, options.chunk))
     return (Camera.pinhole(sensor[::-1]) if lens is None else lens.camera(sensor)), not known
 
 

@@ -25,6 +25,7 @@ class Recording:
     truth is T_wc in metres, plane (normal [1, 3], distance [1] m) in the same world; either may be missing.
     count is the number of events, None where only reading the whole file would tell.
     guessed: the sensor's size comes from the events alone, as nothing else told it.
+    later: what `since` asks; None: all events are read.
     """
 
     path: Path
@@ -35,6 +36,11 @@ class Recording:
     truth: Trajectory | None = None
     plane: Plane | None = None
     guessed: bool = False
+    later: Callable[[int], tuple[int, Iterator[Events]]] | None = None
+
+    def since(self, time: int) -> tuple[int, Iterator[Events]]:
+        """How many events are left out, all before a time, µs, and the rest in chunks: quick where the file has an index by time."""
+        return (0, self.chunks()) if self.later is None else self.later(time)
 
     def windows(
         self, events: int, stride: int | None = None, batch: int = 1, device: torch.device | str = "cpu"

@@ -171,13 +171,16 @@ def _between(recording: Recording, start: int, end: int) -> Generator[tuple[int,
     A chunk with none of them is handed on too, so that closing never waits for more than one chunk.
     """
     first = last = None
-    for chunk in recording.chunks():
+    before, chunks = recording.since(start)
+    if before:
+        yield before, _nothing()
+    for chunk in chunks:
         if not len(chunk):
             continue
         last = int(chunk.t[-1])
         if first is None:
             first = int(chunk.t[0])
-            if end <= first:
+            if end <= first and not before:
                 remedy = (
                     f"its clock begins at {first * 1e-6:.6f} s, `torchcmax info` tells where it stops: give an end after the first event"
                 )
@@ -186,8 +189,9 @@ def _between(recording: Recording, start: int, end: int) -> Generator[tuple[int,
         yield low, chunk[low:high]
         if high < len(chunk):
             return
-    if first is None or last is None:
+    if not before and last is None:
         raise DataError(recording.path, "holds no events", "record or copy it again")
-    if last < start:
-        remedy = f"its clock runs from {first * 1e-6:.6f} s to {last * 1e-6:.6f} s: give a start before the last event"
+    if last is None or last < start:
+        clock = "" if before or first is None or last is None else f"its clock runs from {first * 1e-6:.6f} s to {last * 1e-6:.6f} s: "
+        remedy = f"{clock}give a start before the last event"
         raise DataError(recording.path, f"has no event from the start at {start * 1e-6:.6f} s on", remedy)
