@@ -232,16 +232,16 @@ def test_version(capsys):
 
 
 def test_an_interrupted_run_keeps_what_is_done(demo, tmp_path, capsys, monkeypatch):
-    import torchcmax.cli as cli
+    import torchcmax.commands.compensate as command
 
-    real = cli.compensate
+    real = command.compensate
 
     def interrupted(*arguments):
         parts = real(*arguments)
         yield next(parts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "compensate", interrupted)
+    monkeypatch.setattr(command, "compensate", interrupted)
     status, _, err = run(capsys, "compensate", demo, "--events", 5000, "--batch", 2, "--out", tmp_path / "o")
     assert status == 130
     assert "what was finished is kept" in err

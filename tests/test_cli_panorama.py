@@ -13,6 +13,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchcmax.cli import main
+from torchcmax.commands import following
 from torchcmax.core import so3
 from torchcmax.io import open
 from torchcmax.io.trajectory import read_trajectory
@@ -20,7 +21,16 @@ from torchcmax.mapfile import load_map
 from torchcmax.simulator import Simulation, write
 from torchcmax.slam.globe import Globe
 
-FILES = {"trajectory.txt", "windows.csv", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5", "summary.json"}
+FILES = {
+    "trajectory.txt",
+    "truth.txt",
+    "windows.csv",
+    "keyframes.csv",
+    "panorama.png",
+    "panorama_cropped.png",
+    "panorama.h5",
+    "summary.json",
+}
 BRIEF = ("--mapping.first", 3, "--to", 0.3, "--images", 0, "--quiet")
 
 
@@ -336,16 +346,14 @@ def test_maps_of_planes_and_panoramas_are_told_apart(street, small, folder, wall
 
 
 def test_an_interrupted_run_keeps_what_is_done(street, tmp_path, capsys, monkeypatch):
-    import torchcmax.cli as cli
-
-    real = cli.Progress.update
+    real = following.Progress.update
 
     def interrupted(self):
         real(self)
         if len(self._report.table) == 6:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.Progress, "update", interrupted)
+    monkeypatch.setattr(following.Progress, "update", interrupted)
     status, _, err = run(capsys, "panorama", street, "--mapping.first", 3, "--out", tmp_path / "o")
     assert status == 130
     assert "what was finished is kept" in err

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from torchcmax.cli import main
+from torchcmax.commands import following
 from torchcmax.io.trajectory import read_trajectory
 
 SHORT = ("--mapping.first", 5, "--to", 0.3)  # the recording is short
@@ -145,16 +146,14 @@ def test_a_run_that_fails_before_its_first_window_leaves_the_earlier_results(sma
 
 
 def test_an_interrupted_run_keeps_what_is_done(small, tmp_path, capsys, monkeypatch):
-    import torchcmax.cli as cli
-
-    real = cli.Progress.update
+    real = following.Progress.update
 
     def interrupted(self):
         real(self)
         if len(self._report.table) == 6:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.Progress, "update", interrupted)
+    monkeypatch.setattr(following.Progress, "update", interrupted)
     status, _, err = run(capsys, "track", small, *SHORT, "--out", tmp_path / "o")
     assert status == 130
     assert "what was finished is kept" in err

@@ -6,7 +6,7 @@ from pathlib import Path
 LAYER = {
     "kernels": 0, "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "board": 3,
     "rig": 3, "score": 3, "folder": 3, "picture": 3, "mapfile": 3, "mapimage": 3, "quality": 3, "panoimage": 4,
-    "config": 4, "report": 4, "batch": 4, "track": 4, "judge": 5, "tracktable": 5, "trackreport": 6, "panoreport": 7, "cli": 8,
+    "config": 4, "report": 4, "batch": 4, "track": 4, "judge": 5, "tracktable": 5, "trackreport": 6, "panoreport": 7, "commands": 8, "cli": 9,
 }  # fmt: skip
 ABOVE = {("simulator", "texture"), ("simulator", "sensor")}  # three files of one thing
 ORDER = [

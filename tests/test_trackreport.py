@@ -225,7 +225,7 @@ def test_a_disk_that_fills_up_at_the_end_is_named_and_the_table_stays(small, tmp
         report(tmp_path, small, every=0)
     assert len(lines_of(tmp_path / WINDOWS)) > 7
     assert lines_of(tmp_path / WINDOWS)[3]["qw"]
-    assert written(tmp_path) == {WINDOWS, "summary.json", "trajectory.txt", "map.png"}
+    assert written(tmp_path) == {WINDOWS, "summary.json", "trajectory.txt", "truth.txt", "map.png"}
 
 
 @pytest.mark.parametrize("name", ["map.png", "trajectory.txt", WINDOWS])

@@ -17,8 +17,8 @@ from torchcmax.io import DataError, Recording
 
 SUMMARY, WINDOWS, PICTURES = "summary.json", "windows.csv", "window_*.png"
 LIVE = ".windows.live.csv"  # the table while a run goes on
-TRACKED = ("trajectory.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
-TURNED = ("trajectory.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only
+TRACKED = ("trajectory.txt", "truth.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
+TURNED = ("trajectory.txt", "truth.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only
 MORE = re.compile(r"(map|panorama)_\d+\.h5")  # maps that were not joined with the main one
 COLUMNS = (
     "index start_us end_us events contrast_zero contrast gain omega_x omega_y omega_z v_x v_y v_z n_x n_y n_z evaluations converged"

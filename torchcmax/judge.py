@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -13,6 +13,15 @@ from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.score import Score, Similarity, errors, inside, rotation, score, similarity
 from torchcmax.track import Tracks
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The score with the plane's angle | curves: errors at each time, µs | truth: at the poses' times, in their world and unit."""
+
+    error: dict[str, Any]
+    curves: dict[int, dict[str, float]]
+    truth: Trajectory
 
 
 class Judge:
@@ -51,8 +60,8 @@ class Judge:
         R = there.R[0] @ pose.R[0].mT
         return Similarity(R, there.t[0] - scale * (R @ pose.t[0]), scale)
 
-    def final(self, trajectory: Trajectory, normal: Tensor) -> tuple[dict[str, Any], dict[int, dict[str, float]]] | None:
-        """The score with the plane's angle, and errors at each time, µs, after the best similarity; None where truth tells nothing.
+    def final(self, trajectory: Trajectory, normal: Tensor) -> Judged | None:
+        """All of it after the best similarity; None where truth tells nothing.
 
         normal [1, 3]: of the plane, in the trajectory's world
         """
@@ -64,16 +73,19 @@ class Judge:
             kept = inside(trajectory, self.truth, start, end)
         except ValueError:  # the truth is of another time
             return None
-        best = (rotation if self.turning else similarity)(kept.pose, self.truth.at(kept.time))
+        there = self.truth.at(kept.time)
+        best = (rotation if self.turning else similarity)(kept.pose, there)
         position, orientation = errors(kept, self.truth, best)
         curves = {t: {"error/final_orientation_deg": value} for t, value in zip(kept.time.tolist(), orientation.tolist(), strict=True)}
         angle = None
         if self.plane is not None and not self.turning:
             for curve, value in zip(curves.values(), (100 * position / self.plane.distance[0]).tolist(), strict=True):
                 curve["error/final_percent_of_distance"] = value
-            there, here = self.plane.normal[0], best.R @ normal[0].cpu().double()
-            angle = float(torch.rad2deg(torch.atan2(torch.linalg.cross(here, there).norm(), here @ there)))
-        return asdict(found) | {"plane_deg": angle}, curves
+            true, own = self.plane.normal[0], best.R @ normal[0].cpu().double()
+            angle = float(torch.rad2deg(torch.atan2(torch.linalg.cross(own, true).norm(), own @ true)))
+        laid = best.back(there)
+        truth = Trajectory(kept.time, Pose(laid.R, torch.zeros_like(laid.t)) if self.turning else laid)
+        return Judged(asdict(found) | {"plane_deg": angle}, curves, truth)
 
 
 def on_cpu(pose: Pose) -> Pose:

@@ -144,6 +144,7 @@ class Report:
             "complete": stopped is None,
             "stopped_by": stopped,
             "recording": self.recording.name,
+            "path": str(self.recording.path.resolve()),
             "model": self.options.model,
             "windows": len(self.table),
             "events": int(events),

@@ -27,6 +27,10 @@ class Similarity:
         """The estimate's poses [M] in the truth's world, t in metres."""
         return Pose(self.R @ pose.R, self.scale * (pose.t @ self.R.mT) + self.t)
 
+    def back(self, pose: Pose) -> Pose:
+        """The truth's poses [M] in the estimate's world and unit."""
+        return Pose(self.R.mT @ pose.R, (pose.t - self.t) @ self.R / self.scale)
+
 
 @dataclass(frozen=True)
 class Score:

@@ -68,6 +68,7 @@ class TrackReport:
         self.table: list[Row] = []
         self.files: list[str] = []
         self.error: dict[str, Any] | None = None
+        self.truth: Trajectory | None = None
         self.curves: dict[int, dict[str, float]] = {}
         self.failed: DataError | OSError | None = None
         self.events = self.pictured = 0
@@ -212,7 +213,7 @@ class TrackReport:
         trajectory = Trajectory(trajectory.time[keep].cpu(), on_cpu(trajectory.pose[keep]))
         found = self.judge.final(trajectory, self.tracks.map.plane.normal)
         if found is not None:
-            self.error, self.curves = found
+            self.error, self.curves, self.truth = found.error, found.curves, found.truth
         return trajectory
 
     def _show_end(self, board: Board) -> None:
@@ -231,8 +232,9 @@ class TrackReport:
         for name, page in self._pages().items():
             outputs[name] = partial(self._write, name, partial(_save_page, page))
         if trajectory is not None:
-            metric = in_metres(trajectory, unit)
-            outputs["trajectory.txt"] = lambda: self._write("trajectory.txt", lambda name: write_trajectory(name, metric))
+            outputs["trajectory.txt"] = self._poses("trajectory.txt", in_metres(trajectory, unit))
+        if self.truth is not None:
+            outputs["truth.txt"] = self._poses("truth.txt", in_metres(self.truth, unit))
         if self.tracks.options.map is None:
             stem = self.names[-1].removesuffix(".h5")
             outputs[f"{stem}.h5"] = partial(save_map, self.folder / f"{stem}.h5", m)
@@ -240,6 +242,9 @@ class TrackReport:
                 name = f"{stem}_{other.number}.h5"
                 outputs[name] = partial(save_map, self.folder / name, other)
         return outputs
+
+    def _poses(self, name: str, trajectory: Trajectory) -> Callable[[], None]:
+        return lambda: self._write(name, lambda temporary: write_trajectory(temporary, trajectory))
 
     def _write(self, name: str, write: Callable[[Path], object]) -> None:
         with writing(self.folder / name) as temporary:
@@ -281,6 +286,7 @@ class TrackReport:
             "complete": stopped is None,
             "stopped_by": stopped,
             "recording": self.tracks.recording.name,
+            "path": str(self.tracks.recording.path.resolve()),
             "model": self.tracks.options.slam.model,
             "windows": len(self.table),
             "status": dict(Counter(line["status"] for line in self.table)),

@@ -44,6 +44,11 @@ def _file(path: Path) -> Iterator[Any]:
         raise DataError(path, f"cannot be read as HDF5: {error}", "copy or download it again; it may be cut off or damaged") from error
 
 
+def knows(path: Path, head: bytes) -> bool:
+    """Whether it is an HDF5 file."""
+    return bool(h5py.is_hdf5(path))
+
+
 def contents(path: Path) -> Contents:
     """What the file holds; its events are looked at for their kinds and lengths only."""
     with _file(path) as file:

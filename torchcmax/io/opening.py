@@ -7,26 +7,42 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
-
-import h5py
+from typing import Protocol
 
 from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
+from torchcmax.io import hdf5
 from torchcmax.io.calibration import ECD_FORM, Lens, checked_size, guess_sensor, read_lens
 from torchcmax.io.checked import Source, checked
 from torchcmax.io.contents import Contents
 from torchcmax.io.errors import DataError, DataWarning
 from torchcmax.io.events import Events
-from torchcmax.io.hdf5 import contents
 from torchcmax.io.member import GZIP, UTF16, Member, image_size, not_a_file, open_zip, reading
 from torchcmax.io.recording import Recording
 from torchcmax.io.text import NUMBER, check_text, line_of, read_text
 from torchcmax.io.trajectory import read_plane, read_trajectory
 
-WANTED = "give a folder with events.txt (lines t x y p) or events.h5, and calib.txt; the same as a .zip; or an HDF5 file"
+WANTED = (
+    "give a file of AEDAT4, Prophesee RAW or DAT, ES, a ROS 1 bag, HDF5, npz or text; or a folder, or .zip, with events.txt or events.h5 "
+    "and calib.txt"
+)
+LENSES = ("calib.txt", "calib.yaml", "camchain*.yaml", "*-camchain.yaml", "camera_info.yaml")  # beside the events, the first that is there
+
+
+class Format(Protocol):
+    """A module that reads a family of files: whether a file that begins like this is one of them, and what it holds."""
+
+    def knows(self, path: Path, head: bytes) -> bool: ...
+
+    def contents(self, path: Path) -> Contents: ...
+
+
+FORMATS: tuple[Format, ...] = (hdf5,)
+HEAD = 4096  # bytes by which a file is known
 
 
 @dataclass(frozen=True)
@@ -44,7 +60,7 @@ class OpenOptions:
 
 
 def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
-    """The recording at a path: a folder with events.txt or events.h5, a .zip of the first, or an HDF5 file.
+    """The recording at a path: a file of any format that we know, or a folder with one, or a .zip with events.txt.
 
     Files are known by what is in them, not by their endings.  Events are read when they are asked for.  Only where neither the
     options, the files nor the first picture in images/ tell the sensor's size, all events are read once to find it (`guess_sensor`).
@@ -57,18 +73,25 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
             return _folder(path, options)
         if not path.is_file():
             raise DataError(path, not_a_file(path, "file or folder"), "check the name; " + WANTED)
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    if not head:
+    if (head := _head(path)) == b"":
         raise DataError(path, "is empty", WANTED)
-    if h5py.is_hdf5(path):
-        return _hdf5(path, options)
+    if (form := _form(path, head)) is not None:
+        return _binary(form, path, options)
     if head.startswith(b"PK") or zipfile.is_zipfile(path):
         return _text(open_zip(path), path, path.stem, options)
-    if path.suffix == ".txt" or _like_events(head) or head.startswith((GZIP, *UTF16)):
+    if path.suffix in (".txt", ".csv") or _like_events(head) or head.startswith((GZIP, *UTF16)):
         return _text(path.parent, path, path.parent.resolve().name, options, path.name)
     kind = "should be an HDF5 file and is none" if path.suffix in (".h5", ".hdf5") else "is not a recording"
     raise DataError(path, f"{kind}: it begins with {head[:16]!r}", WANTED)
+
+
+def _head(path: Path) -> bytes:
+    with reading(path), path.open("rb") as stream:
+        return stream.read(HEAD)
+
+
+def _form(path: Path, head: bytes) -> Format | None:
+    return next((form for form in FORMATS if form.knows(path, head)), None)
 
 
 def _like_events(head: bytes) -> bool:
@@ -78,15 +101,22 @@ def _like_events(head: bytes) -> bool:
 
 
 def _folder(folder: Path, options: OpenOptions) -> Recording:
+    """events.h5, or events.txt, or else the only file of a format that we know."""
     if (folder / "events.h5").is_file():
         if (folder / "events.txt").is_file():
             text = f"{folder}: holds events.h5 and events.txt; events.txt is ignored, to read it give its own path"
             warnings.warn(DataWarning(text), stacklevel=3)
-        return _hdf5(folder / "events.h5", options, folder)
+        return _binary(hdf5, folder / "events.h5", options, folder)
     if (folder / "events.txt").is_file():
         return _text(folder, folder / "events.txt", folder.resolve().name, options)
-    names = sorted(entry.name for entry in folder.iterdir())
-    found = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    entries = sorted(folder.iterdir())
+    known = [(form, entry) for entry in entries if entry.is_file() and (form := _form(entry, _head(entry))) is not None]
+    if len(known) == 1:
+        return _binary(*known[0], options, folder)
+    if known:
+        names = ", ".join(entry.name for _, entry in known[:4]) + (f" and {len(known) - 4} more" if len(known) > 4 else "")
+        raise DataError(folder, f"holds several recordings: {names}", "give the path of one")
+    found = ", ".join(entry.name for entry in entries[:4]) + (f" and {len(entries) - 4} more" if len(entries) > 4 else "")
     raise DataError(folder, f"is a folder without a recording; it holds {found or 'nothing'}", WANTED)
 
 
@@ -98,9 +128,9 @@ def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: s
     return _recording(path, str(file), found, options, folder)
 
 
-def _hdf5(path: Path, options: OpenOptions, folder: Path | None = None) -> Recording:
-    """A recording in an HDF5 file.  The files of the folder go before what stands in it, unless our own file is opened by itself."""
-    found = contents(path)
+def _binary(form: Format, path: Path, options: OpenOptions, folder: Path | None = None) -> Recording:
+    """A recording in one file."""
+    found = form.contents(path)
     return _recording(path, str(path), found, options, path.parent if folder is None and not found.own else folder)
 
 
@@ -132,16 +162,24 @@ def _camera(folder: Member | None, found: Contents, file: str, options: OpenOpti
     lens: Lens | None = None
     if options.camera and options.camera != "pinhole":
         lens = read_lens(Path(options.camera))
-    elif not options.camera and folder is not None and (folder / "calib.txt").is_file():
-        lens = read_lens(folder / "calib.txt")
     elif not options.camera:
-        lens = found.lens
+        beside = None if folder is None else _lens_file(folder)
+        lens = found.lens if beside is None else read_lens(beside)
         if lens is None:
             remedy = f"put {ECD_FORM} into a file calib.txt beside the events, give --camera FILE, or --camera pinhole [--sensor 240x180]"
             raise DataError(file, "there is no calibration for it", remedy)
     known = options.sensor or (lens and lens.sensor) or found.sensor
     sensor = checked_size(file, *known) if known else guess_sensor(file, lens, partial(found.events, options.chunk))
     return (Camera.pinhole(sensor[::-1]) if lens is None else lens.camera(sensor)), not known
+
+
+def _lens_file(folder: Member) -> Member | None:
+    """The calibration beside the events."""
+    entries = sorted((entry for entry in folder.iterdir() if entry.is_file()), key=lambda entry: entry.name)
+    for pattern in LENSES:
+        if found := [entry for entry in entries if fnmatch(entry.name, pattern)]:
+            return found[0]
+    return None
 
 
 def _truth(folder: Member) -> tuple[Trajectory | None, Plane | None]:
