@@ -53,15 +53,6 @@ def test_options_behind_a_config_override_it(demo, tmp_path, capsys):
     assert (settings["events"], settings["model"], settings["look"]["contrast"]) == (7000, "planar", "mean_square")
 
 
-@pytest.mark.parametrize("config", sorted((Path(__file__).parents[1] / "configs").glob("*.yaml")), ids=lambda p: p.stem)
-def test_every_config_of_the_project_is_understood(config, demo, tmp_path, capsys):
-    word = config.stem.rpartition("_")[2]
-    command = ("simulate",) if word == "simulate" else ("track" if word in ("track", "thesis") else "compensate", demo)
-    status, out, err = run(capsys, *command, "--config", config, "--out", tmp_path / "o", "--print_config")
-    assert status == 0, err
-    assert yaml.safe_load(out)
-
-
 def test_info_says_what_is_there(demo, capsys):
     status, out, _ = run(capsys, "info", demo)
     assert status == 0

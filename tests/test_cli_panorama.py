@@ -24,6 +24,7 @@ from torchcmax.slam.globe import Globe
 FILES = {
     "trajectory.txt",
     "truth.txt",
+    "report.html",
     "windows.csv",
     "keyframes.csv",
     "panorama.png",
@@ -101,7 +102,7 @@ def test_it_says_how_it_went_and_where_to_look(street, tmp_path, capsys):
 def test_all_files_are_written_and_the_summary_names_them(folder):
     names = {p.name for p in folder.iterdir()}
     assert {n for n in names if not n.startswith("events.out.tfevents.")} == {*FILES, "images"}
-    assert set(summary(folder)["files"]) == FILES - {"summary.json"}
+    assert set(summary(folder)["files"]) == FILES - {"summary.json", "report.html"}
     assert {p.name for p in (folder / "images").iterdir()} == {f"window_{i:05d}.png" for i in (0, 4, 8)}
 
 
@@ -360,7 +361,7 @@ def test_an_interrupted_run_keeps_what_is_done(street, tmp_path, capsys, monkeyp
     found = summary(tmp_path / "o")
     assert found["complete"] is False
     assert found["stopped_by"].startswith("KeyboardInterrupt")
-    assert set(found["files"]) == FILES - {"summary.json"}
+    assert set(found["files"]) == FILES - {"summary.json", "report.html"}
     assert found["windows"] == len(rows(tmp_path / "o" / "windows.csv")) == 6
     assert len(read_trajectory(tmp_path / "o" / "trajectory.txt")) == 6
     assert found["error"]["orientation_rmse_deg"] < 1

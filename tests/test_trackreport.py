@@ -65,7 +65,7 @@ def board(folder):
 
 def test_all_that_is_promised_is_there_and_nothing_else(run):
     names = {p.name for p in run.folder.iterdir() if not p.name.startswith("events.out")}
-    assert names == {WINDOWS, "summary.json", "images", *TRACKED}
+    assert names == {WINDOWS, "summary.json", "report.html", "images", *TRACKED}
     assert written(run.folder) == names - {"images"}
 
 
@@ -225,7 +225,7 @@ def test_a_disk_that_fills_up_at_the_end_is_named_and_the_table_stays(small, tmp
         report(tmp_path, small, every=0)
     assert len(lines_of(tmp_path / WINDOWS)) > 7
     assert lines_of(tmp_path / WINDOWS)[3]["qw"]
-    assert written(tmp_path) == {WINDOWS, "summary.json", "trajectory.txt", "truth.txt", "map.png"}
+    assert written(tmp_path) == {WINDOWS, "summary.json", "report.html", "trajectory.txt", "truth.txt", "map.png"}
 
 
 @pytest.mark.parametrize("name", ["map.png", "trajectory.txt", WINDOWS])
@@ -246,7 +246,7 @@ def test_runs_of_both_commands_replace_each_other_and_nothing_else(demo, small, 
 
     report(tmp_path, small, every=0)
     compensated()
-    assert {p.name for p in tmp_path.iterdir() if "tfevents" not in p.name} == {WINDOWS, "summary.json", "images"}
+    assert {p.name for p in tmp_path.iterdir() if "tfevents" not in p.name} == {WINDOWS, "summary.json", "report.html", "images"}
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "map.png").write_text("mine")
     compensated()
@@ -270,7 +270,7 @@ def test_a_summary_cannot_name_files_of_others(small, tmp_path):
     (tmp_path / "precious").write_text("x")
     summary = {"versions": {"torchcmax": "1"}, "files": ["../precious", "notes.txt", WINDOWS]}
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
-    assert written(tmp_path / "run") == {WINDOWS, "summary.json"}
+    assert written(tmp_path / "run") == {WINDOWS, "summary.json", "report.html"}
     for broken in ("[]", "3", '{"versions": 3}', '{"versions": {"torchcmax": 1}, "files": 3}', "{"):
         (tmp_path / "run" / "summary.json").write_text(broken)
         with pytest.raises(DataError, match=r"holds summary\.json"):

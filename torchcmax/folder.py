@@ -16,6 +16,7 @@ from torchcmax import __version__
 from torchcmax.io import DataError, Recording
 
 SUMMARY, WINDOWS, PICTURES = "summary.json", "windows.csv", "window_*.png"
+PAGE = "report.html"
 LIVE = ".windows.live.csv"  # the table while a run goes on
 TRACKED = ("trajectory.txt", "truth.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
 TURNED = ("trajectory.txt", "truth.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only
@@ -64,7 +65,7 @@ def check_place(folder: Path, recording: Recording, names: tuple[str, ...] = ())
     except OSError as error:
         raise unwritable(folder, error) from error
     left = written(folder)
-    foreign = [name for name in (SUMMARY, WINDOWS, *names) if name not in left and (folder / name).exists()]
+    foreign = [name for name in (SUMMARY, WINDOWS, PAGE, *names) if name not in left and (folder / name).exists()]
     if foreign or (not left and any((folder / "images").glob(PICTURES))):
         raise DataError(folder, f"holds {foreign[0] if foreign else PICTURES}, which no run of ours wrote", "give another --out")
 
@@ -75,7 +76,7 @@ def written(folder: Path) -> set[str]:
         summary = json.loads((folder / SUMMARY).read_text())
         names = summary.get("files", [WINDOWS]) if "torchcmax" in summary["versions"] else None
         ours = {name for name in names or () if name in (WINDOWS, *TRACKED, *TURNED) or MORE.fullmatch(name)}
-        return set() if names is None else {SUMMARY} | ours
+        return set() if names is None else {SUMMARY, PAGE} | ours
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()
 

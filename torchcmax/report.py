@@ -21,6 +21,7 @@ from torchcmax.core.warp import still
 from torchcmax.core.window import Window
 from torchcmax.folder import COLUMNS, LIVE, SUMMARY, WHOLE, WINDOWS, cell, check_place, clear, unwritable, versions, writing
 from torchcmax.io import Recording
+from torchcmax.page import write_page
 from torchcmax.picture import captioned, pictures, png
 
 CURVES = 5  # windows whose optimizer is shown evaluation by evaluation, of those that are pictured
@@ -127,6 +128,7 @@ class Report:
             (self.folder / LIVE).replace(self.folder / WINDOWS)
             with writing(self.folder / SUMMARY) as name:
                 name.write_text(json.dumps(self.summary(None if kind is None else f"{kind.__name__}: {error}"), indent=1) + "\n")
+            write_page(self.folder)
         except OSError as full:
             if error is None:  # else the first error is the one to tell
                 raise unwritable(self.folder, full) from full

@@ -29,6 +29,7 @@ from torchcmax.io.trajectory import write_trajectory
 from torchcmax.judge import Judge, on_cpu
 from torchcmax.mapfile import save_map
 from torchcmax.mapimage import LARGEST, picture
+from torchcmax.page import write_page
 from torchcmax.picture import captioned, pictures, png
 from torchcmax.slam.map import Map
 from torchcmax.slam.system import Track
@@ -189,7 +190,7 @@ class TrackReport:
         self._attempt(lambda: self._show_end(board))
         for name, write in self._outputs(trajectory).items():
             self._attempt(write, name)
-        for last in (self._csv.close, self._keep_live, board.close, lambda: self._summarize(stopped)):
+        for last in (self._csv.close, self._keep_live, board.close, lambda: self._summarize(stopped), lambda: write_page(self.folder)):
             self._attempt(last)
 
     def _attempt(self, write: Callable[[], object], name: str = "") -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from jsonargparse.typing import Path_fr
 from tqdm import tqdm
 
 from torchcmax import batch
+from torchcmax.batchpage import write_batch_page
 from torchcmax.cluster import Cluster, distributed
 from torchcmax.commands import compensate, panorama, track
 from torchcmax.commands.arguments import available_cores, check_device, folder, made, opening
@@ -34,17 +35,17 @@ MODULES = {"compensate": compensate, "track": track, "panorama": panorama}
 def build() -> Parser:
     """Its options.  --config is for the task, so this is no parser of `command`."""
     sub = Parser(
-        description="Do a task with many recordings. Each result is a folder of --out, which appears when it is whole, with manifest.json and "
-        "log.txt; what fails goes to a folder NAME.failed and does not stop the others. The same command again does only what is missing or "
-        "failed. Writes batch.csv, batch.json and report.html on all results."
+        description="Do a task with many recordings. Each result is a folder of --out, which appears when it is whole, with manifest.json "
+        "and log.txt; what fails goes to a folder NAME.failed and does not stop the others. The same command again does only what is "
+        "missing or failed. Writes batch.csv, batch.json and report.html on all results."
     )
     sub.add_argument("recordings", type=str, nargs="+", help="recordings, or folders to be searched for them")
     sub.add_argument("--task", type=str, choices=TASKS, required=True, help="what to do with each: one of " + ", ".join(TASKS))
     sub.add_argument("--out", type=str, required=True, help="folder to write; look at it with: tensorboard --logdir DIR")
     sub.add_argument("--config", type=Path_fr, action="append", help="YAML file with options of the task; can be given again")
     sub.add_argument("--set", type=str, action="append", metavar="KEY=VALUE", help="an option of the task, for all; can be given again")
-    sub.add_argument("--sweep", type=str, action="append", metavar="KEY=A,B,C", help="run with each of these values; can be given again: all "
-                     "combinations")  # fmt: skip
+    values = "run with each of these values; can be given again: all combinations"
+    sub.add_argument("--sweep", type=str, action="append", metavar="KEY=A,B,C", help=values)
     sub.add_argument("--device", type=str, default="", help="cpu or cuda, instead of what the configuration says")
     sub.add_argument("--workers", type=int, default=0, help="jobs at a time; 0: one for each core, or one on a GPU")
     sub.add_argument("--address", type=str, default="", help="of a Ray cluster to run on: auto, or ray://HOST:PORT")
@@ -74,7 +75,7 @@ def run(config: Namespace) -> int:
         finally:
             rows = batch.results(out, jobs)
             batch.write_tables(out, rows)
-    page = batch.write_page(out, rows, _page_writer())
+    page = write_batch_page(out, rows) if rows else None
     return _told(jobs, left, done, out, page)
 
 
@@ -101,7 +102,7 @@ def understood(config: Namespace, options: Sequence[str]) -> dict[str, Any]:
     if task == "compensate":
         made(Compensation, found)
     else:
-        slam = made(Slam if task == "track" else Panorama, found)
+        slam: Slam | Panorama = made(Slam, found) if task == "track" else made(Panorama, found)
         with usage():
             TrackOptions(slam, found["from"], found.to, found.get("distance"), found.map, found.device)
     if config.address and found.device.startswith("cuda:"):
@@ -169,14 +170,6 @@ def _go(jobs: list[Job], config: Namespace, device: str) -> list[Manifest]:
                     bar.write(f"failed: {manifest['folder']}: {manifest['error']}", file=sys.stderr)
                 bar.update()
     return done
-
-
-def _page_writer() -> Callable[[Path, list[Manifest]], Path] | None:
-    try:
-        from torchcmax.batchpage import write_batch_page
-    except ImportError:
-        return None
-    return write_batch_page
 
 
 def _told(jobs: list[Job], left: list[Job], done: list[Manifest], out: Path, page: Path | None) -> int:

@@ -15,6 +15,7 @@ import yaml
 from torchcmax.core.camera import MODELS, Camera
 from torchcmax.io.errors import DataError, DataWarning
 from torchcmax.io.events import Events
+from torchcmax.io.lensfiles import in_our_words, yaml_of
 from torchcmax.io.member import Member, not_a_file, text_lines, text_of
 
 SENSORS = ((128, 128), (240, 180), (304, 240), (346, 260), (480, 360), (640, 480), (1280, 720))  # width, height px, smallest first
@@ -101,12 +102,13 @@ def _ecd_lens(file: Member, lines: list[tuple[int, str]]) -> Lens:
 
 
 def _yaml_lens(file: Member, text: str) -> Lens:
-    """Our own form; model and distortion may be left out."""
+    """Our own form, of which model and distortion may be left out, or that of another tool (lensfiles.py)."""
     wants = f"it wants {', '.join(YAML_KEYS)} (model: {' or '.join(MODELS)})"
     try:
-        found = yaml.safe_load(text)
+        found = yaml_of(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # the second: a date that is none; the third: nested a thousand deep
         raise DataError(str(file), f"is no YAML: {error}", wants) from error
+    found = in_our_words(str(file), found)
     if not isinstance(found, dict) or not set(found) <= set(YAML_KEYS):
         raise DataError(str(file), f"holds {', '.join(map(str, found)) if isinstance(found, dict) else reprlib.repr(found)}", wants)
     lens = told_lens(str(file), found, wants)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -147,8 +147,11 @@ def _converted(path: Path, columns: dict[str, np.ndarray], start: int) -> Events
     return Events(*(columns[name].astype(kind, copy=False) for name, kind in NAMES.items()))
 
 
-def save(recording: Recording, path: Path | str) -> None:
-    """Writes a recording as our own HDF5 file, chunk by chunk, under another name until it is whole."""
+def save(recording: Recording, path: Path | str, progress: Callable[[int], object] | None = None) -> None:
+    """Writes a recording as our own HDF5 file, chunk by chunk, under another name until it is whole.
+
+    progress: is told how many events are written so far
+    """
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     remedy = "choose another folder, or make room on the disk"
@@ -157,7 +160,7 @@ def save(recording: Recording, path: Path | str) -> None:
             raise DataError(path, f"{path.parent} is no folder", "make the folder first, or choose another")
         with h5py.File(part, "w") as file:
             _write_rest(file, recording)
-            _write_events(file.create_group("events"), recording, path.parent)
+            _write_events(file.create_group("events"), recording, path.parent, progress)
         part.replace(path)
     except (OSError, RuntimeError) as error:
         raise DataError(path, f"cannot be written: {error}", remedy) from error
@@ -180,7 +183,7 @@ def _write_rest(file: Any, recording: Recording) -> None:
         file["plane"] = torch.cat([recording.plane.normal[0], recording.plane.distance]).double().numpy()
 
 
-def _write_events(group: Any, recording: Recording, folder: Path) -> None:
+def _write_events(group: Any, recording: Recording, folder: Path, progress: Callable[[int], object] | None) -> None:
     """Datasets that grow with every chunk."""
     packed = {"chunks": (STORED,), "compression": "gzip", "compression_opts": 1, "shuffle": True}
     columns = {name: group.create_dataset(name, (0,), kind, maxshape=(None,), **packed) for name, kind in NAMES.items()}
@@ -192,3 +195,5 @@ def _write_events(group: Any, recording: Recording, folder: Path) -> None:
             column.resize((count + len(chunk),))
             column[count:] = getattr(chunk, name)
         count += len(chunk)
+        if progress is not None:
+            progress(count)
