@@ -89,9 +89,12 @@ def _check_shared(ray: Any, out: Path) -> None:
 
     word, file = uuid.uuid4().hex, out / RUNNING / "word"
     file.write_text(word)
-    look = ray.remote(_seen).options(num_cpus=0, max_retries=0)
+    look = ray.remote(_seen)
     nodes = {node["NodeID"]: node["NodeManagerHostname"] for node in ray.nodes() if node["Alive"]}
-    asked = {look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(one, soft=False)).remote(str(file)): one for one in nodes}
+    asked = {}
+    for one in nodes:
+        there = NodeAffinitySchedulingStrategy(one, soft=False)
+        asked[look.options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote(str(file))] = one
     for task, node in asked.items():
         try:
             seen = ray.get(task, timeout=REPLY)
