@@ -1,4 +1,4 @@
-"""HDF5 files: the simulator's layout, and our own, which `save` writes."""
+"""HDF5 files: the simulator's layout, our own, which `save` writes, and those of layouts.py."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from torchcmax.io.calibration import Lens, told_lens
 from torchcmax.io.contents import Contents
 from torchcmax.io.errors import DataError
 from torchcmax.io.events import LATEST, Events
+from torchcmax.io.layouts import Layout, event_before, layout_of, read_columns
 from torchcmax.io.recording import Recording
 from torchcmax.io.trajectory import checked_plane, checked_trajectory
 
 NAMES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
-VERSION = 1
+VERSION = 2  # 1 had no index
 STORED = 1 << 17  # events per compressed piece of a file
 WANTS = "it wants the datasets events/t (integer us), events/x, events/y (px), events/p (0 or 1), of the same length"
 FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on broken files
@@ -52,17 +53,22 @@ def knows(path: Path, head: bytes) -> bool:
 def contents(path: Path) -> Contents:
     """What the file holds; its events are looked at for their kinds and lengths only."""
     with _file(path) as file:
-        count = _count(path, file)
         own = file.attrs.get("format") == "torchcmax"
         version = _attribute(file.attrs.get("version"))
-        if own and version != VERSION:
+        if own and version not in (1, VERSION):
             raise DataError(path, f"is of version {version}, not {VERSION}", "read it with the torchcmax that wrote it, or a newer one")
-        sizes = next((group.attrs for group in (file, file["events"]) if {"width", "height"} <= set(group.attrs)), None)
+        layout = None if own else layout_of(path, file)
+        count = len(file[layout.columns["t"][0]]) if layout else _count(path, file)
+        sizes = next((group.attrs for group in (file, file.get("events", file)) if {"width", "height"} <= set(group.attrs)), None)
         sensor = None if sizes is None else (_attribute(sizes["width"]), _attribute(sizes["height"]))
         lens = _lens(path, file if own else file.get("calib"))
+        if layout:
+            sensor, lens = sensor or layout.sensor, lens or layout.lens
         truth, plane = _truth(path, file, "truth" if own else "groundtruth"), _plane(path, file, "plane" if own else "groundtruth/plane")
-        events, name = partial(read_events, path), str(file.attrs.get("name", ""))
-        return Contents(events, lambda event: f"event {event + 1}", count, name, own, sensor, lens, truth, plane)
+        events, name = partial(read_events, path, layout=layout), str(file.attrs.get("name", ""))
+        indexed = bool(layout.index) if layout else own and version == VERSION
+        since = partial(_since, path, layout) if indexed else None
+        return Contents(events, lambda event: f"event {event + 1}", count, name, own, sensor, lens, truth, plane, since)
 
 
 def _attribute(value: Any) -> Any:
@@ -123,15 +129,31 @@ def _numbers(path: Path, file: Any, name: str) -> np.ndarray:
     return numbers
 
 
-def read_events(path: Path, chunk: int) -> Iterator[Events]:
-    """Events as they stand in the file, `chunk` at a time."""
-    start = 0
+def _since(path: Path, layout: Layout | None, time: int, chunk: int) -> tuple[int, Iterator[Events]]:
+    """How many events are left out, all before a time, µs, and the rest in chunks."""
+    with _file(path) as file:
+        event = event_before(file, layout, time) if layout else _piece_before(path, file, time)
+    return event, read_events(path, chunk, layout, event)
+
+
+def _piece_before(path: Path, file: Any, time: int) -> int:
+    """First event of the last stored piece that begins before a time, µs; 0 where none does."""
+    index, count = _numbers(path, file, "index"), len(file["events/t"])
+    if len(index) != -(-count // STORED) or (np.diff(index) < 0).any():
+        raise DataError(path, f"its index of {len(index)} times does not fit its {count} events", "convert the recording again")
+    return max(int(np.searchsorted(index, time)) - 1, 0) * STORED
+
+
+def read_events(path: Path, chunk: int, layout: Layout | None = None, start: int = 0) -> Iterator[Events]:
+    """Events as they stand in the file, `chunk` at a time, from event `start` on."""
     while True:
         with _file(path) as file:  # not held open between chunks: a yield within would blame the file for the caller's errors
-            group = file["events"]
-            if start >= len(group["t"]):
+            if start >= len(file[layout.columns["t"][0] if layout else "events/t"]):
                 return
-            columns = {name: group[name][start : start + chunk] for name in NAMES}
+            if layout:
+                columns = read_columns(path, file, layout, start, start + chunk)
+            else:
+                columns = {name: file["events"][name][start : start + chunk] for name in NAMES}
         yield _converted(path, columns, start)
         start += chunk
 
@@ -161,6 +183,7 @@ def save(recording: Recording, path: Path | str, progress: Callable[[int], objec
         with h5py.File(part, "w") as file:
             _write_rest(file, recording)
             _write_events(file.create_group("events"), recording, path.parent, progress)
+            file["index"] = file["events/t"][::STORED]  # first time of every stored piece
         part.replace(path)
     except (OSError, RuntimeError) as error:
         raise DataError(path, f"cannot be written: {error}", remedy) from error

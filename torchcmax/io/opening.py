@@ -15,7 +15,7 @@ from typing import Protocol
 from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
-from torchcmax.io import dv, hdf5, prophesee
+from torchcmax.io import dv, hdf5, npz, prophesee, rosbag
 from torchcmax.io.calibration import ECD_FORM, Lens, checked_size, guess_sensor, read_lens
 from torchcmax.io.checked import Source, checked
 from torchcmax.io.contents import Contents
@@ -41,7 +41,7 @@ class Format(Protocol):
     def contents(self, path: Path) -> Contents: ...
 
 
-FORMATS: tuple[Format, ...] = (hdf5, prophesee, dv)
+FORMATS: tuple[Format, ...] = (hdf5, prophesee, dv, rosbag, npz)
 HEAD = 4096  # bytes by which a file is known
 
 
