@@ -156,7 +156,8 @@ def test_without_truth_there_is_no_error_and_without_plane_none_of_position():
     assert judge(with_truth=False).final(found, plane.normal) is None
     for kind in (judge(with_plane=False), judge(model="rotation")):
         assert set(kind.live(found.time, found.pose, plane)[5]) == {"error/live_orientation_deg"}
-        error, curves = kind.final(found, plane.normal)
+        final = kind.final(found, plane.normal)
+        error, curves = final.error, final.curves
         assert error["percent_of_distance"] is None
         assert error["plane_deg"] is None
         assert set(curves[found.time[5].item()]) == {"error/final_orientation_deg"}
@@ -166,7 +167,11 @@ def test_the_final_error_is_after_the_similarity():
     found, plane = seen(0.01)
     turn = so3.exp(torch.tensor([0.3, -1.0, 0.7], dtype=torch.float64))
     moved = Trajectory(found.time, Pose(turn @ found.pose.R, 5 * found.pose.t @ turn.mT + 3))
-    error, curves = judge().final(moved, plane.normal @ turn.mT)
+    final = judge().final(moved, plane.normal @ turn.mT)
+    error, curves = final.error, final.curves
+    assert torch.equal(final.truth.time, moved.time)
+    apart = (final.truth.pose.t - moved.pose.t).norm(dim=-1).square().mean().sqrt()
+    assert 0 < apart < 0.05 * moved.pose.t.std()  # the truth lies where the estimate is, in its unit
     assert error["coverage"] == pytest.approx(1)
     assert 0 < error["percent_of_distance"] < 1
     rms = torch.tensor([line["error/final_percent_of_distance"] for line in curves.values()]).square().mean().sqrt().item()
@@ -193,4 +198,4 @@ def test_kernels_are_loaded_by_tracking_something(model, monkeypatch):
 def test_the_final_error_tells_how_far_the_plane_is_tilted(angle):
     found, plane = seen()
     normal = plane.normal @ so3.exp(torch.tensor([0.0, angle, 0.0], dtype=torch.float64)).mT
-    assert judge().final(found, normal)[0]["plane_deg"] == pytest.approx(math.degrees(angle), abs=1e-6)
+    assert judge().final(found, normal).error["plane_deg"] == pytest.approx(math.degrees(angle), abs=1e-6)

@@ -89,6 +89,7 @@ def work(job: Job) -> Manifest:
         attempt.mkdir()
         manifest["input"], manifest["files"] = fingerprint(job.recording)
         manifest["exit"] = _call(job, attempt)
+        _move_names(attempt / LOG, attempt, job.failure if manifest["exit"] else job.place)
         manifest["error"] = said(attempt / LOG, job.task) if manifest["exit"] else None
     except OSError as error:  # of the recording, the folder or the log: unreadable, the disk is full, not seen from this host
         manifest |= {"exit": 1, "error": f"{error.filename or attempt}: {error.strerror or error}"}
@@ -169,6 +170,11 @@ def _into(log: TextIO) -> Iterator[None]:
         for number, copy in zip((1, 2), kept, strict=True):
             os.dup2(copy, number)
             os.close(copy)
+
+
+def _move_names(log: Path, attempt: Path, place: Path) -> None:
+    """The log names the files where they will be found."""
+    log.write_text(log.read_text(errors="replace").replace(str(attempt), str(place)))
 
 
 def said(log: Path, task: str) -> str:

@@ -81,13 +81,18 @@ def read_result(folder: Path) -> Result:
         raise DataError(folder / SUMMARY, "is not a summary of a run of ours", "give a folder that compensate, track or panorama wrote")
     numbers, texts = _windows(folder)
     extra = {name: read_json(folder, name) if inside(folder, name) else {} for name in EXTRA}
-    keyframes = inside(folder, "keyframes.csv")
+    followed = "panorama" in summary or "plane" in summary  # else it is of compensate, and a map in its folder is somebody else's
+
+    def ours(name: str) -> Path | None:
+        return inside(folder, name) if followed else None
+
+    keyframes = ours("keyframes.csv")
     found = inside(folder, "images")
     images = sorted(found.iterdir()) if found is not None and found.is_dir() else []
     pictures = {int(match[1]): path for path in images if (match := PICTURE.fullmatch(path.name)) and inside(folder, f"images/{path.name}")}
     count = None if keyframes is None else max(0, len(_lines(keyframes)) - 1)
-    maps = [path for name in MAPS if (path := inside(folder, name)) is not None]
-    poses = _poses(folder, "trajectory.txt"), _poses(folder, "truth.txt")
+    maps = [path for name in MAPS if (path := ours(name)) is not None]
+    poses = (_poses(folder, "trajectory.txt"), _poses(folder, "truth.txt")) if followed else (None, None)
     return Result(folder, summary, extra["manifest.json"], extra["evaluation.json"], numbers, texts, count, *poses, maps, pictures)
 
 

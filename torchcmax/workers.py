@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 
+from tqdm import tqdm
+
 from torchcmax.job import UNEXPECTED, Job, Manifest, died, work
 
 LEAVE = 10.0  # s that an idle process has to end by itself, and to give back what it holds
@@ -126,6 +128,7 @@ def _alone() -> Iterator[None]:
 def serve(pipe: Connection) -> None:
     """The life of a worker: jobs come through the pipe, manifests go back."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system's, which a killed process leaves behind
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:

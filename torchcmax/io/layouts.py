@@ -101,7 +101,7 @@ def _check_stored(path: Path, data: Any, name: str) -> None:
             with suppress(ImportError):
                 import hdf5plugin  # noqa: F401  # it registers its filters
         if not h5py.h5z.filter_avail(code):
-            remedy = "pip install 'torchcmax[formats]'"
+            remedy = "pip install 'torchcmax[io]'"
             if code == 0x8ECF:
                 remedy = "install Metavision's ECF plugin and set HDF5_PLUGIN_PATH, or give the RAW file"
             raise DataError(path, f"{name} is packed by the HDF5 filter {code}, which is not installed", remedy)
