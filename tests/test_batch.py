@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from torchcmax import batch
+from torchcmax import batch, job
 from torchcmax.cli import main
 from torchcmax.config import UsageError
 
@@ -149,6 +149,24 @@ def test_a_folder_that_is_being_written_to_is_not_taken(tmp_path):
 
     with batch.claimed(tmp_path), pytest.raises(DataError, match="another batch is writing there"), batch.claimed(tmp_path):
         pass
+
+
+def test_a_log_names_files_where_they_end_up_and_a_full_disk_leaves_it_as_it_was(tmp_path, monkeypatch):
+    attempt, place, log = tmp_path / ".running" / "00000.a", tmp_path / "a", tmp_path / "log.txt"
+    log.write_text(f"motions: {attempt}/windows.csv\n")
+
+    def full(path, text):
+        with path.open("w") as stream:
+            stream.write("half")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "write_text", full)
+        job._move_names(log, attempt, place)
+    assert log.read_text() == f"motions: {attempt}/windows.csv\n"
+    job._move_names(log, attempt, place)
+    assert log.read_text() == f"motions: {place}/windows.csv\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["log.txt"]
 
 
 def test_names_are_told_apart_by_the_folders_above():

@@ -13,7 +13,7 @@ import traceback
 import uuid
 import warnings
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from contextlib import chdir, contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
@@ -173,8 +173,14 @@ def _into(log: TextIO) -> Iterator[None]:
 
 
 def _move_names(log: Path, attempt: Path, place: Path) -> None:
-    """The log names the files where they will be found."""
-    log.write_text(log.read_text(errors="replace").replace(str(attempt), str(place)))
+    """The log names the files where they will be found; where that cannot be written, it stays as it is."""
+    moved = log.with_name(f".{log.name}.part")
+    try:
+        moved.write_text(log.read_text(errors="replace").replace(str(attempt), str(place)))
+        moved.replace(log)
+    except OSError:  # a full disk takes neither the log nor the job's own error
+        with suppress(OSError):
+            moved.unlink(missing_ok=True)
 
 
 def said(log: Path, task: str) -> str:
