@@ -10,13 +10,13 @@ from typing import Any
 import torch
 
 from torchcmax import __version__
-from torchcmax.commands import batch, compensate, convert, info, panorama, report, simulate, track
+from torchcmax.commands import batch, compensate, convert, evaluate, info, panorama, report, simulate, track
 from torchcmax.config import USAGE_ERROR, Parser, UsageError, parser
 from torchcmax.io import DataError, DataNote, DataWarning
 
 COMMANDS = {
     "simulate": simulate, "info": info, "convert": convert, "compensate": compensate, "track": track, "panorama": panorama, "batch": batch,
-    "report": report,
+    "evaluate": evaluate, "report": report,
 }  # fmt: skip
 KEEPING = ("compensate", "track", "panorama", "batch")  # commands that leave what was finished when they are stopped
 DATA_ERROR, INTERRUPTED = 1, 130

@@ -17,6 +17,7 @@ from torchcmax.io import DataError, Recording
 
 SUMMARY, WINDOWS, PICTURES = "summary.json", "windows.csv", "window_*.png"
 PAGE = "report.html"
+EVALUATION = ("evaluation.json", "evaluation.csv")  # of `evaluate`, about the run that is there
 LIVE = ".windows.live.csv"  # the table while a run goes on
 TRACKED = ("trajectory.txt", "truth.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
 TURNED = ("trajectory.txt", "truth.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only
@@ -76,7 +77,7 @@ def written(folder: Path) -> set[str]:
         summary = json.loads((folder / SUMMARY).read_text())
         names = summary.get("files", [WINDOWS]) if "torchcmax" in summary["versions"] else None
         ours = {name for name in names or () if name in (WINDOWS, *TRACKED, *TURNED) or MORE.fullmatch(name)}
-        return set() if names is None else {SUMMARY, PAGE} | ours
+        return set() if names is None else {SUMMARY, PAGE, *EVALUATION} | ours
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()
 

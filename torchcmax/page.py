@@ -91,7 +91,7 @@ def build_page(result: Result) -> str:
         section("Motion", resultplots.motion(result)),
         section("Panorama" if result.task == "panorama" else "Map", _maps(result)),
         section("Best and worst windows", _windows(result)),
-        section("Evaluation", generic(result.evaluation)),
+        section("Evaluation", _evaluation(result.evaluation)),
         section("How it was made", _made(result)),
     ]
     return document(f"{result.task} of {name}", body, HOVER)
@@ -155,6 +155,22 @@ def _flat(values: dict[str, Any], before: str = "") -> dict[str, Any]:
     for name, value in values.items():
         found |= _flat(value, f"{before}{name}.") if isinstance(value, dict) else {before + str(name): value}
     return found
+
+
+def _evaluation(found: dict[str, Any]) -> str:
+    """What `evaluate` found: a column for each protocol, a line for each measure that any of them has."""
+    rows = found.get("results")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        return generic(found)
+    names = [name for name in dict.fromkeys(name for row in rows for name in row) if name not in ("result", "protocol")]
+    head = "".join(f'<th scope="col">{escape(str(row.get("protocol", "")))}</th>' for row in rows)
+    lines = "".join(
+        f'<tr><th scope="row">{escape(name.replace("_", " "))}</th>{"".join(f"<td>{number(row.get(name))}</td>" for row in rows)}</tr>'
+        for name in names
+        if any(row.get(name) is not None for row in rows)
+    )
+    plain = {name: value for name, value in found.items() if not isinstance(value, dict | list)}
+    return f'<div class="wide"><table><tr><th></th>{head}</tr>{lines}</table></div>{facts(plain)}'
 
 
 def _state(result: Result) -> str:

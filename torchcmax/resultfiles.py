@@ -16,6 +16,7 @@ from torchcmax.folder import LIVE, SUMMARY, WINDOWS
 from torchcmax.io import DataError
 
 AGAIN = "repair it, or run the command that wrote the folder again"
+BATCH = "batch.json"
 EXTRA = {"manifest.json": "the manifest of its batch", "evaluation.json": "what `evaluate` wrote"}
 TEXTS = ("status", "reason", "weakest")  # columns of windows.csv that are no numbers
 NEEDED = ("index", "start_us", "end_us", "events", "gain")
@@ -94,6 +95,17 @@ def read_result(folder: Path) -> Result:
     maps = [path for name in MAPS if (path := ours(name)) is not None]
     poses = (_poses(folder, "trajectory.txt"), _poses(folder, "truth.txt")) if followed else (None, None)
     return Result(folder, summary, extra["manifest.json"], extra["evaluation.json"], numbers, texts, count, *poses, maps, pictures)
+
+
+def finished(path: Path) -> list[Path]:
+    """The results of a batch that came to their end; of any other path, the path."""
+    if not inside(path, BATCH):
+        return [path]
+    rows = read_json(path, BATCH).get("results")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise DataError(path / BATCH, "has no list of results", AGAIN)
+    places = [inside(path, str(row.get("folder", ""))) for row in rows if row.get("exit") == 0]
+    return [place for place in places if place is not None and place.resolve() != path.resolve()]
 
 
 def inside(folder: Path, name: str) -> Path | None:

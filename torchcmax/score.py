@@ -79,7 +79,7 @@ def rotation(estimate: Pose, truth: Pose) -> Similarity:
 
 def inside(estimate: Trajectory, truth: Trajectory, start_us: int | None = None, end_us: int | None = None) -> Trajectory:
     """The estimate's poses within the truth's time and start..end, both included."""
-    first, last = _span(truth, start_us, end_us)
+    first, last = common(truth, start_us, end_us)
     keep = (estimate.time >= first) & (estimate.time <= last)
     count, own = int(keep.sum()), f"it covers {estimate.time[0].item()}..{estimate.time[-1].item()} us"
     if count < 2:
@@ -108,13 +108,13 @@ def score(
 
     plane [1] of the truth, in metres | rotation_only: align by one rotation, and compare orientations only
     """
-    span = _span(truth, start_us, end_us)
+    span = common(truth, start_us, end_us)
     kept = inside(estimate, truth, *span)
     there = truth.at(kept.time.to(truth.time.device))
     best = rotation(kept.pose, there) if rotation_only else similarity(kept.pose, there)
     position, orientation = errors(kept, truth, best)
     rmse = None if rotation_only else _rms(position)
-    path = _path(truth, span)
+    path = path_length(truth, span)
     return Score(
         poses=len(kept),
         position_rmse_m=rmse,
@@ -123,12 +123,12 @@ def score(
         percent_of_distance=100 * rmse / plane.distance[0].item() if rmse is not None and plane is not None else None,
         orientation_rmse_deg=_rms(orientation),
         orientation_max_deg=orientation.max().item(),
-        coverage=_coverage(kept.time, span),
+        coverage=coverage(kept.time, span),
         scale=None if rotation_only else best.scale.item(),
     )
 
 
-def _span(truth: Trajectory, start_us: int | None, end_us: int | None) -> tuple[int, int]:
+def common(truth: Trajectory, start_us: int | None = None, end_us: int | None = None) -> tuple[int, int]:
     """The truth's time between start and end, µs."""
     first, last = int(truth.time[0]), int(truth.time[-1])
     start, end = first if start_us is None else max(start_us, first), last if end_us is None else min(end_us, last)
@@ -167,13 +167,13 @@ def _nearest_rotation(moment: Tensor) -> Tensor:
     return R
 
 
-def _path(truth: Trajectory, span: tuple[int, int]) -> float:
+def path_length(truth: Trajectory, span: tuple[int, int]) -> float:
     """Length of the path through the truth's own poses within the span, m."""
     t = truth.pose.t[(truth.time >= span[0]) & (truth.time <= span[1])]
     return float(t.diff(dim=0).norm(dim=-1).sum())
 
 
-def _coverage(time: Tensor, span: tuple[int, int]) -> float:
+def coverage(time: Tensor, span: tuple[int, int]) -> float:
     """Share of the span, µs, less the gaps that are longer than GAP, those before the first and behind the last pose too."""
     ends = time.new_tensor(span)
     gaps = torch.cat([ends[:1], time, ends[1:]]).diff()

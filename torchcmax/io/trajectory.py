@@ -1,8 +1,9 @@
-"""Text files of poses (TUM), planes and velocities."""
+"""Text files of poses (TUM, EuRoC), planes and velocities."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchcmax.io.events import LATEST
 from torchcmax.io.member import LARGE, SMALL, Member, text_lines, text_of
 
 TUM = "t tx ty tz qx qy qz qw"
+EUROC = "t[ns],px,py,pz,qw,qx,qy,qz, and more that is not read"
 VELOCITY = "t[s]  v_x v_y v_z [m/s]  w_x w_y w_z [rad/s]   (body frame = camera frame)"
 PLANE = "nx ny nz d   with n.X + d = 0 in the world frame, n unit and towards the camera, d > 0"
 
@@ -26,6 +28,29 @@ def read_trajectory(file: Member) -> Trajectory:
     rows = _rows(file, 8, f"a line is {TUM}", LARGE)
     table = np.array([values for _, values in rows]).reshape(-1, 8)
     return checked_trajectory(str(file), table[:, 0] * 1e6, table[:, 1:4], table[:, 4:], lambda i: f"line {rows[i][0]}")
+
+
+def read_euroc(file: Member) -> Trajectory:
+    """Poses from EuRoC's csv: lines `t[ns],px,py,pz,qw,qx,qy,qz,...` -> Trajectory as of `read_trajectory`.
+
+    Of state_groundtruth_estimate0 (17 columns) or a motion capture system (8), Burri et al., IJRR 2016.  Whole ns are rounded to µs.
+    """
+    lines = text_lines(text_of(file, LARGE))
+    if lines and not lines[0][1][:1].isdigit():
+        lines = lines[1:]  # the names of the columns, where no # marks them
+    time, rows = [], []
+    for number, line in lines:
+        words = line.split(",")
+        try:
+            time.append(round(Fraction(words[0].strip()) / 1000))
+            rows.append([float(word) for word in words[1:8]])
+        except (ValueError, ZeroDivisionError) as error:
+            raise DataError(str(file), f"not all are numbers: {line[:80]!r}", f"a line is {EUROC}", f"line {number}") from error
+        if len(rows[-1]) < 7:
+            raise DataError(str(file), f"{len(words)} columns: {line[:80]!r}", f"a line is {EUROC}", f"line {number}")
+    table = np.array(rows).reshape(-1, 7)
+    micro = np.array([t if abs(t) < LATEST else LATEST for t in time], np.int64)  # what is out of range is refused below
+    return checked_trajectory(str(file), micro, table[:, :3], table[:, [4, 5, 6, 3]], lambda i: f"line {lines[i][0]}")
 
 
 def checked_trajectory(file: str, time: np.ndarray, p: np.ndarray, q: np.ndarray, place: Callable[[int], str]) -> Trajectory:
