@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -21,16 +22,21 @@ from torchcmax.core.pose import Trajectory
 from torchcmax.io.calibration import Lens, told_lens
 from torchcmax.io.contents import Contents
 from torchcmax.io.errors import DataError
-from torchcmax.io.events import LATEST, Events
-from torchcmax.io.layouts import Layout, event_before, layout_of, read_columns
+from torchcmax.io.events import Events
+from torchcmax.io.layouts import AGAIN, Layout, Truth, check_stored, event_before, layout_of, numbers, read_layout
+from torchcmax.io.member import LARGE
 from torchcmax.io.recording import Recording
+from torchcmax.io.tables import as_events
 from torchcmax.io.trajectory import checked_plane, checked_trajectory
 
 NAMES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 VERSION = 2  # 1 had no index
 STORED = 1 << 17  # events per compressed piece of a file
 WANTS = "it wants the datasets events/t (integer us), events/x, events/y (px), events/p (0 or 1), of the same length"
-FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on broken files
+REWRITE = "write the ground truth again, or take it out of the file"
+FAILURES = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError)  # what h5py raises on broken files
+HEAP, SEARCHED = b"GCOL", 4 << 20  # how a heap of text begins; bytes in which it is looked for
+MANY = LARGE // 8  # numbers of a trajectory or an index
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF5 crashes the process when it finds it full
 
@@ -42,7 +48,28 @@ def _file(path: Path) -> Iterator[Any]:
         with h5py.File(path, "r") as file:
             yield file
     except FAILURES as error:
-        raise DataError(path, f"cannot be read as HDF5: {error}", "copy or download it again; it may be cut off or damaged") from error
+        raise DataError(path, f"cannot be read as HDF5: {error}", AGAIN) from error
+
+
+def _check_heap(path: Path) -> None:
+    """DataError where a heap of text, near the beginning or the end of the file, has an entry of no size: HDF5 would read it forever."""
+    with path.open("rb") as stream:
+        parts = [stream.read(SEARCHED)]
+        stream.seek(max(stream.seek(0, os.SEEK_END) - SEARCHED, SEARCHED))
+        parts.append(stream.read(SEARCHED))
+    for data in parts:
+        start = data.find(HEAP)
+        while start >= 0:
+            at, end = start + 16, min(start + int.from_bytes(data[start + 8 : start + 16], "little"), len(data))
+            if data[start + 4 : start + 8] != b"\1\0\0\0":  # its version; else these are other bytes that look alike
+                end = 0
+            while at + 16 <= end:
+                index, size = struct.unpack_from("<H6xQ", data, at)
+                step = 16 + -(-size // 8) * 8 if index else size
+                if not step:
+                    raise DataError(path, "cannot be read as HDF5: an entry of a heap has no size", AGAIN)
+                at += step
+            start = data.find(HEAP, start + 1)
 
 
 def knows(path: Path, head: bytes) -> bool:
@@ -51,8 +78,9 @@ def knows(path: Path, head: bytes) -> bool:
 
 
 def contents(path: Path) -> Contents:
-    """What the file holds; its events are looked at for their kinds and lengths only."""
+    """What the file holds; its events are looked at for their kinds and lengths, and a few for their units."""
     with _file(path) as file:
+        _check_heap(path)
         own = file.attrs.get("format") == "torchcmax"
         version = _attribute(file.attrs.get("version"))
         if own and version not in (1, VERSION):
@@ -65,6 +93,8 @@ def contents(path: Path) -> Contents:
         if layout:
             sensor, lens = sensor or layout.sensor, lens or layout.lens
         truth, plane = _truth(path, file, "truth" if own else "groundtruth"), _plane(path, file, "plane" if own else "groundtruth/plane")
+        if layout and layout.truth and truth is None:
+            truth = _truth_beside(layout.truth)
         events, name = partial(read_events, path, layout=layout), str(file.attrs.get("name", ""))
         indexed = bool(layout.index) if layout else own and version == VERSION
         since = partial(_since, path, layout) if indexed else None
@@ -89,6 +119,8 @@ def _count(path: Path, file: Any) -> int:
     if any(not isinstance(data, h5py.Dataset) or data.ndim != 1 or data.dtype.kind not in "iub" for data in found.values()):
         kinds = ", ".join(f"{name}: {getattr(data, 'dtype', 'group')} {getattr(data, 'shape', '')}" for name, data in found.items())
         raise DataError(path, f"has events of another kind: {kinds}", WANTS)
+    for name, data in found.items():
+        check_stored(path, data, f"events/{name}")
     lengths = {name: len(data) for name, data in found.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(path, f"has events of different lengths: {lengths}", WANTS)
@@ -110,23 +142,32 @@ def _truth(path: Path, file: Any, name: str) -> Trajectory | None:
     """Poses from t, p, q (x, y, z, w) of a group; the simulator's t is in seconds, ours in µs."""
     if name not in file:
         return None
-    t, p, q = (_numbers(path, file, f"{name}/{column}") for column in "tpq")
+    t, p, q = (numbers(path, file, f"{name}/{column}", REWRITE, MANY) for column in "tpq")
     time = t if t.dtype.kind in "iu" else t * 1e6
     return checked_trajectory(str(path), time, p, q, lambda i: f"{name}, pose {i + 1}")
 
 
+def _truth_beside(told: Truth) -> Trajectory:
+    """Poses from matrices of a file of ground truth."""
+    path, remedy = told.file, "copy or download it again, or move it elsewhere"
+    with _file(path) as file:
+        pose, time = (numbers(path, file, name, remedy, MANY).astype(np.float64) for name in (told.poses, told.times))
+    if pose.ndim != 3 or pose.shape[1:] != (4, 4):
+        raise DataError(path, f"{told.poses} has the shape {pose.shape}, not (M, 4, 4)", remedy)
+    R, p = pose[:, :3, :3], pose[:, :3, 3]
+    rigid = (abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 0.01) & (np.linalg.det(R) > 0)
+    if not rigid.all():
+        raise DataError(path, f"{told.poses} holds a matrix that is no rotation", remedy, f"pose {int((~rigid).argmax()) + 1}")
+    if told.inverse:
+        R = R.transpose(0, 2, 1)
+        p = -(R @ p[:, :, None])[:, :, 0]
+    q = so3.to_quaternion(torch.from_numpy(R.copy())).numpy()
+    return checked_trajectory(str(path), time * told.unit, p, q, lambda i: f"{told.poses}, pose {i + 1}")
+
+
 def _plane(path: Path, file: Any, name: str) -> Plane | None:
     """The plane from its four numbers."""
-    return checked_plane(str(path), _numbers(path, file, name).reshape(-1), name) if name in file else None
-
-
-def _numbers(path: Path, file: Any, name: str) -> np.ndarray:
-    """All numbers of a dataset."""
-    data = file.get(name)
-    if not isinstance(data, h5py.Dataset) or data.shape is None or data.dtype.kind not in "iuf":
-        raise DataError(path, f"{name} is missing or holds no numbers", "write the ground truth again, or take it out of the file")
-    numbers: np.ndarray = data[()]
-    return numbers
+    return checked_plane(str(path), numbers(path, file, name, REWRITE).reshape(-1), name) if name in file else None
 
 
 def _since(path: Path, layout: Layout | None, time: int, chunk: int) -> tuple[int, Iterator[Events]]:
@@ -138,9 +179,10 @@ def _since(path: Path, layout: Layout | None, time: int, chunk: int) -> tuple[in
 
 def _piece_before(path: Path, file: Any, time: int) -> int:
     """First event of the last stored piece that begins before a time, µs; 0 where none does."""
-    index, count = _numbers(path, file, "index"), len(file["events/t"])
-    if len(index) != -(-count // STORED) or (np.diff(index) < 0).any():
-        raise DataError(path, f"its index of {len(index)} times does not fit its {count} events", "convert the recording again")
+    count, remedy = len(file["events/t"]), "convert the recording again"
+    index = numbers(path, file, "index", remedy, MANY)
+    if index.ndim != 1 or len(index) != -(-count // STORED) or (index[1:] < index[:-1]).any():
+        raise DataError(path, f"its index of {index.size} times does not fit its {count} events", remedy)
     return max(int(np.searchsorted(index, time)) - 1, 0) * STORED
 
 
@@ -151,22 +193,12 @@ def read_events(path: Path, chunk: int, layout: Layout | None = None, start: int
             if start >= len(file[layout.columns["t"][0] if layout else "events/t"]):
                 return
             if layout:
-                columns = read_columns(path, file, layout, start, start + chunk)
+                events = read_layout(path, file, layout, start, start + chunk)
             else:
                 columns = {name: file["events"][name][start : start + chunk] for name in NAMES}
-        yield _converted(path, columns, start)
+                events = as_events(path, columns, start, seconds=False, prefix="events/")
+        yield events
         start += chunk
-
-
-def _converted(path: Path, columns: dict[str, np.ndarray], start: int) -> Events:
-    """Columns of any integers as Events; polarity -1 is darker, as 0."""
-    for name, least, most in (("t", 1 - LATEST, LATEST - 1), ("x", 0, 65535), ("y", 0, 65535), ("p", -1, 1)):
-        column = columns[name]
-        if column.dtype.kind != "b" and (int(column.min()) < least or int(column.max()) > most):
-            i = int(((column < least) | (column > most)).argmax())
-            raise DataError(path, f"events/{name} is {column[i]}, not within {least}..{most}", WANTS, f"event {start + i + 1}")
-    columns["p"] = columns["p"] > 0
-    return Events(*(columns[name].astype(kind, copy=False) for name, kind in NAMES.items()))
 
 
 def save(recording: Recording, path: Path | str, progress: Callable[[int], object] | None = None) -> None:
