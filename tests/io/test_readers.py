@@ -18,7 +18,8 @@ from torchcmax.core.camera import Camera
 from torchcmax.core.plane import Plane
 from torchcmax.io import DataWarning, Events, OpenOptions, Recording, open, save
 from torchcmax.io.checked import Source, checked
-from torchcmax.io.text import _plain, read_text
+from torchcmax.io.columns import Form
+from torchcmax.io.text import _plain, _tidy, read_text
 
 DAVIS = Camera((180, 240), 199.09, 198.83, 132.19, 110.71, (-0.3684, 0.1509, -0.000296, -0.000759, 0.0))
 FISHEYE = Camera((60, 80), 40.0, 41.0, 39.5, 29.5, (0.01, -0.002, 0.0003, 0.0), "kannala_brandt")
@@ -149,14 +150,14 @@ def test_many_plain_lines_are_exact_to_the_microsecond(end, digits):
     up = (width > 6) & (beyond > 500)
     x, y, p = (rng.integers(0, most, 500) for most in (240, 180, 2))
     lines = "".join(f"{s} {a} {b} {c}{end}" for s, a, b, c in zip(seconds, x, y, p, strict=True)).encode()
-    same(_plain(lines), Events(exact + up, x.astype("u2"), y.astype("u2"), p.astype("u1")))
+    same(_plain(_tidy(lines, Form()), Form()), Events(exact + up, x.astype("u2"), y.astype("u2"), p.astype("u1")))
 
 
 @pytest.mark.parametrize("line", [b"1.0 2 3 1\r5\n", b"1.0 2 3\r1 \n", b"1.0 2 3 1\n\r", b"1 0.2 3 1\r\n"])
 def test_marks_in_another_place_are_not_read_as_plain_lines(line):
     good = b"1.0 2 3 1\r\n"
-    assert _plain(good + good) is not None
-    assert _plain(good + line) is None
+    assert _plain(_tidy(good + good, Form()), Form()) is not None
+    assert _plain(_tidy(good + line, Form()), Form()) is None
 
 
 def test_tabs_spaces_and_floats_that_are_whole_are_read(tmp_path):
@@ -196,7 +197,7 @@ def test_two_recordings_in_a_folder_are_told(tmp_path):
 
 def test_times_up_to_the_bound_are_read_from_text_and_hdf5(tmp_path):
     t = np.array([-(2**60), 2**60])
-    (tmp_path / "a.txt").write_text(f"{t[0] / 1e6:.0f} 1 2 1\n{t[1] / 1e6:.0f} 1 2 1\n")
+    (tmp_path / "a.txt").write_text(f"{t[0] / 1e6:.1f} 1 2 1\n{t[1] / 1e6:.1f} 1 2 1\n")
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, data in (("t", t), ("x", [1, 1]), ("y", [2, 2]), ("p", [1, 1])):
             file[f"events/{name}"] = data

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -23,12 +22,12 @@ from torchcmax.io.errors import DataError, DataWarning
 from torchcmax.io.events import Events
 from torchcmax.io.member import GZIP, UTF16, Member, image_size, not_a_file, open_zip, reading
 from torchcmax.io.recording import Recording
-from torchcmax.io.text import NUMBER, check_text, line_of, read_text
+from torchcmax.io.text import check_text, like_text, line_of, read_text
 from torchcmax.io.trajectory import read_plane, read_trajectory
 
 WANTED = (
-    "give a file of AEDAT4, Prophesee RAW or DAT, ES, a ROS 1 bag, HDF5, npz or text; or a folder, or .zip, with events.txt or events.h5 "
-    "and calib.txt"
+    "give a file of AEDAT4, Prophesee RAW or DAT, ES, a ROS 1 bag, HDF5, npz, npy or text; or a folder, or .zip, with events.txt or "
+    "events.h5 and calib.txt"
 )
 LENSES = ("calib.txt", "calib.yaml", "camchain*.yaml", "*-camchain.yaml", "camera_info.yaml")  # beside the events, the first that is there
 
@@ -43,6 +42,8 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (hdf5, prophesee, dv, rosbag, npz)
 HEAD = 4096  # bytes by which a file is known
+TEXTS = (".txt", ".csv")
+OTHERS = ("calib.txt", "groundtruth.txt", "plane.txt", "images.txt", "imu.txt", "velocity.txt")  # beside events, never events
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
         return _binary(form, path, options)
     if head.startswith(b"PK") or zipfile.is_zipfile(path):
         return _text(open_zip(path), path, path.stem, options)
-    if path.suffix in (".txt", ".csv") or _like_events(head) or head.startswith((GZIP, *UTF16)):
+    if path.suffix in TEXTS or like_text(head) or head.startswith((GZIP, *UTF16)):
         return _text(path.parent, path, path.parent.resolve().name, options, path.name)
     kind = "should be an HDF5 file and is none" if path.suffix in (".h5", ".hdf5") else "is not a recording"
     raise DataError(path, f"{kind}: it begins with {head[:16]!r}", WANTED)
@@ -94,14 +95,8 @@ def _form(path: Path, head: bytes) -> Format | None:
     return next((form for form in FORMATS if form.knows(path, head)), None)
 
 
-def _like_events(head: bytes) -> bool:
-    """Whether the first line that is no comment has four columns, the first a number."""
-    lines = [line.split() for line in head.removeprefix(codecs.BOM_UTF8).split(b"\n") if line.strip() and not line.startswith(b"#")]
-    return bool(lines) and len(lines[0]) == 4 and NUMBER.fullmatch(lines[0][0].decode("ascii", "replace")) is not None
-
-
 def _folder(folder: Path, options: OpenOptions) -> Recording:
-    """events.h5, or events.txt, or else the only file of a format that we know."""
+    """events.h5, or events.txt, or else the only file of a format that we know, or else the only text of events."""
     if (folder / "events.h5").is_file():
         if (folder / "events.txt").is_file():
             text = f"{folder}: holds events.h5 and events.txt; events.txt is ignored, to read it give its own path"
@@ -109,22 +104,36 @@ def _folder(folder: Path, options: OpenOptions) -> Recording:
         return _binary(hdf5, folder / "events.h5", options, folder)
     if (folder / "events.txt").is_file():
         return _text(folder, folder / "events.txt", folder.resolve().name, options)
-    entries = sorted(folder.iterdir())
+    entries = sorted(entry for entry in folder.iterdir() if not entry.stem.endswith("_gt"))  # of MVSEC and M3ED: truth
     known = [(form, entry) for entry in entries if entry.is_file() and (form := _form(entry, _head(entry))) is not None]
     if len(known) == 1:
         return _binary(*known[0], options, folder)
     if known:
-        names = ", ".join(entry.name for _, entry in known[:4]) + (f" and {len(known) - 4} more" if len(known) > 4 else "")
-        raise DataError(folder, f"holds several recordings: {names}", "give the path of one")
-    found = ", ".join(entry.name for entry in entries[:4]) + (f" and {len(entries) - 4} more" if len(entries) > 4 else "")
-    raise DataError(folder, f"is a folder without a recording; it holds {found or 'nothing'}", WANTED)
+        raise _several(folder, [entry for _, entry in known])
+    texts = [entry for entry in entries if entry.suffix in TEXTS and entry.name not in OTHERS and entry.is_file()]
+    texts = [entry for entry in texts if like_text(_head(entry))]
+    if len(texts) == 1:
+        return _text(folder, texts[0], folder.resolve().name, options, texts[0].name)
+    if texts:
+        raise _several(folder, texts)
+    raise DataError(folder, f"is a folder without a recording; it holds {_listed(entries) or 'nothing'}", WANTED)
+
+
+def _several(folder: Path, entries: list[Path]) -> DataError:
+    return DataError(folder, f"holds several recordings: {_listed(entries)}", "give the path of one")
+
+
+def _listed(entries: list[Path]) -> str:
+    """Some names."""
+    return ", ".join(entry.name for entry in entries[:4]) + (f" and {len(entries) - 4} more" if len(entries) > 4 else "")
 
 
 def _text(folder: Member, path: Path, name: str, options: OpenOptions, events: str = "events.txt") -> Recording:
     """A recording as text, in a folder or a .zip."""
     file = folder / events
-    check_text(file)
-    found = Contents(partial(read_text, file), partial(line_of, file), name=name, sensor=image_size(folder))
+    form = check_text(file)
+    sensor = form.sensor or image_size(folder)
+    found = Contents(partial(read_text, file, form=form), partial(line_of, file, form=form), name=name, sensor=sensor)
     return _recording(path, str(file), found, options, folder)
 
 

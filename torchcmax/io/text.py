@@ -1,62 +1,99 @@
-"""Events from text: lines `t x y p`, that is seconds, column, row, 1 (brighter) or 0 or -1 (darker)."""
+"""Events from text: lines `t x y p`, that is seconds, column, row, 1 (brighter) or 0 or -1 (darker), or of any other `Form`."""
 
 from __future__ import annotations
 
 import codecs
-import re
 import shlex
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
 from itertools import islice
+from math import floor
 from typing import IO
 
 import numpy as np
 
-from torchcmax.io.errors import DataError
+from torchcmax.io.columns import ADVICE, NUMBER, SECONDS, Form, form_of
+from torchcmax.io.errors import DataError, DataNote, tell
 from torchcmax.io.events import LATEST, Events
 from torchcmax.io.member import Member, reading, refuse_foreign, size_in_bytes
 
 BLOCK = 1 << 20  # bytes taken apart at a time: fits the processor's cache
 LONGEST = 1 << 16  # bytes of a line; more is no text of events
 FORM = "t x y p, separated by blanks: seconds, column, row, 0 or 1, like 0.003811 96 133 0"
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-BETWEEN = (b".   \n", b".   \r\n")  # what stands between the digits of a line: 1.234567 12 34 1
-MOST = (12, 5, 5, 1)  # digits of whole seconds, column, row, polarity
-SPELLINGS = ((b"\r\n", b"\n"), (b"\t", b" "), (b" -1\n", b" 0\n"))
+LOOKED_AT = 2000  # lines that tell a file's form
+HEAD = 1 << 12  # bytes that tell how a block is written
+DASH = (ord("-") - 48) % 256
+MOST = {"t": 12, "x": 5, "y": 5, "p": 1}  # digits of whole seconds, column, row, polarity
 
 
-def check_text(file: Member) -> None:
-    """Finds a file of another form and a last line that is cut off, before anything is computed.  A .zip is unpacked once for that."""
+def check_text(file: Member) -> Form:
+    """The form of its lines.  Finds a file that holds something else, or whose last line is cut off, before anything is computed.
+
+    A .zip is unpacked once for that.
+    """
     size = size_in_bytes(file)
     if not size:
         raise DataError(str(file), "is empty", "record or copy it again")
     with reading(file), file.open("rb") as stream:
         refuse_foreign(file, stream.read(LONGEST))
-    _check_first(file)
-    _check_last(file, size)
+    form = _form(file)
+    _check_last(file, size, form)
+    if not form.told:
+        tell(DataNote(f"{file}: times are whole numbers, taken for us; if they are not: {ADVICE}"))
+    return form
 
 
-def _check_first(file: Member) -> None:
-    """A first line that is no event: the whole file is of another form, so dropping the line would not help."""
-    for number, first in islice(_data_lines(file), 1):
-        row = first.decode("ascii", "backslashreplace").strip()
-        try:
-            _row(row)
-        except ValueError as error:
-            problem = f"its first line is no event, {error}: {_quoted(row)}"
-            raise DataError(str(file), problem, f"events want lines of {FORM}; put a # before a header", f"line {number}") from error
+def like_text(head: bytes) -> bool:
+    """Whether a file that begins like this, and has no ending that says so, may be a text of events."""
+    rows = [row.decode("ascii", "replace") for row in head.removeprefix(codecs.BOM_UTF8).split(b"\n")[:-1] or [head]]
+    comments = [row for row in rows if row.startswith("#")]
+    lines = [(number, row) for number, row in enumerate(rows, 1) if row.strip() and not row.startswith("#")]
+    try:
+        form = form_of(lines, comments[-1].lstrip("# ") if comments else "")
+        _row(lines[form.skip][1], form)
+    except (ValueError, IndexError):
+        return False
+    return True
 
 
-def _check_last(file: Member, size: int) -> None:
+def _form(file: Member) -> Form:
+    """The form of its first lines; where the first is no event the whole file is of another form, so dropping the line would not help."""
+    comment, rows = "", list[tuple[int, str]]()
+    for number, raw in _lines(file):
+        row = raw.decode("utf-8", "backslashreplace").strip()
+        if row.startswith("#"):
+            comment = comment if rows else row.lstrip("# ")
+        elif row:
+            rows.append((number, row))
+        if len(rows) >= LOOKED_AT:
+            break
+    number, first = 1, ""
+    try:
+        form = form_of(rows, comment)
+        if len(rows) > form.skip:
+            number, first = rows[form.skip]
+            _row(first, form)
+    except ValueError as error:
+        number, first = (number, first) if first else rows[0]
+        problem = f"its first line is no event, {error}: {_quoted(first)}"
+        raise DataError(str(file), problem, f"events want lines of {FORM}; {ADVICE}", f"line {number}") from error
+    return form
+
+
+def _check_last(file: Member, size: int, form: Form) -> None:
     with reading(file), file.open("rb") as stream:
         stream.seek(max(size - LONGEST, 0))
         last = stream.read().rsplit(b"\n", 1)[-1].removeprefix(codecs.BOM_UTF8)
-    if last.strip() and not last.lstrip().startswith(b"#") and len(last.split()) < 4:
+    row = last.decode("ascii", "backslashreplace").strip()
+    if row and not row.startswith("#") and len(form.split(row)) < form.columns:
         with reading(file), file.open("rb") as stream:
             number = sum(block.count(b"\n") for block in _blocks(stream, BLOCK, file))
-        cut = _quoted(last.decode("ascii", "backslashreplace"))
+        if number < form.line:
+            return  # it is the header
         remedy = f"the file was not copied or written to its end; copy it again, or drop the line: {_dropping(file, '$')}"
-        raise DataError(str(file), f"the last line is cut off: {cut}", remedy, f"line {number}")
+        raise DataError(str(file), f"the last line is cut off: {_quoted(row)}", remedy, f"line {number}")
 
 
 def _dropping(file: Member, line: str) -> str:
@@ -66,15 +103,16 @@ def _dropping(file: Member, line: str) -> str:
     return f"sed -i '{line}d' {shlex.quote(str(file))}"
 
 
-def read_text(file: Member, chunk: int, block: int = BLOCK) -> Iterator[Events]:
+def read_text(file: Member, chunk: int, block: int = BLOCK, form: Form = Form()) -> Iterator[Events]:  # noqa: B008
     """Events as they stand in the file, `chunk` at a time; fewer only at the end.  `block`: bytes taken apart at a time."""
     parts: list[Events] = []
     count, line = 0, 1
     with reading(file), file.open("rb") as stream:
         for text in _blocks(stream, block, file):
-            events, lines = _parse(text, line, file)
+            header = min(form.line - line, text.count(b"\n")) if line < form.line else 0
+            events, lines = _parse(_after(text, header), line + header, file, form)
             parts.append(events)
-            count, line = count + len(events), line + lines
+            count, line = count + len(events), line + header + lines
             if count >= chunk:
                 whole = Events.join(parts)
                 for start in range(0, count - chunk + 1, chunk):
@@ -84,18 +122,24 @@ def read_text(file: Member, chunk: int, block: int = BLOCK) -> Iterator[Events]:
         yield Events.join(parts)
 
 
-def line_of(file: Member, event: int) -> str:
+def line_of(file: Member, event: int, form: Form = Form()) -> str:  # noqa: B008
     """Where an event, counted from 0, stands in the file; reads it again up to there."""
-    return next((f"line {number}" for number, _ in islice(_data_lines(file), event, None)), "at its end")
+    data = (number for number, row in _lines(file) if row.strip() and not row.lstrip().startswith(b"#"))
+    return next((f"line {number}" for number in islice(data, form.skip + event, None)), "at its end")
 
 
-def _data_lines(file: Member) -> Iterator[tuple[int, bytes]]:
-    """Lines that are neither empty nor comments, with their numbers, from 1."""
+def _lines(file: Member) -> Iterator[tuple[int, bytes]]:
+    """Lines with their numbers, from 1."""
     with reading(file), file.open("rb") as stream:
-        rows = (row for text in _blocks(stream, BLOCK, file) for row in text.split(b"\n")[:-1])
-        for number, row in enumerate(rows, 1):
-            if row.strip() and not row.lstrip().startswith(b"#"):
-                yield number, row
+        yield from enumerate((row for text in _blocks(stream, BLOCK, file) for row in text.split(b"\n")[:-1]), 1)
+
+
+def _after(text: bytes, lines: int) -> bytes:
+    """What stands behind so many lines."""
+    start = 0
+    for _ in range(lines):
+        start = text.index(b"\n", start) + 1
+    return text[start:]
 
 
 def _blocks(stream: IO[bytes], size: int, file: Member) -> Iterator[bytes]:
@@ -116,50 +160,89 @@ def _blocks(stream: IO[bytes], size: int, file: Member) -> Iterator[bytes]:
         yield rest + b"\n"
 
 
-def _parse(text: bytes, line: int, file: Member) -> tuple[Events, int]:
+def _parse(text: bytes, line: int, file: Member, form: Form) -> tuple[Events, int]:
     """A block of lines as events, and the number of lines: the quick way where every line is plain, else line by line."""
-    events = _plain(text)
-    if events is not None:
-        return events, len(events)
-    for spelling, plain in SPELLINGS:
-        text = text.replace(spelling, plain)
-    events = _plain(text)
-    return _by_line(text, line, file) if events is None else events, text.count(b"\n")
+    events = _plain(text, form) if _is_tidy(text[:HEAD], form) else None  # to tidy takes nearly as long as to read
+    if events is None:
+        events = _plain(_tidy(text, form), form)
+    return _by_line(text, line, file, form) if events is None else events, text.count(b"\n")
 
 
-def _plain(text: bytes) -> Events | None:
+def _is_tidy(head: bytes, form: Form) -> bool:
+    """Whether lines that begin like this have one separator between columns, and nothing else."""
+    return not any(mark in head for mark in ((b"\r", b"\t", b"  ") if form.separator == " " else (b"\r", b"\t", b" ")))
+
+
+def _tidy(text: bytes, form: Form) -> bytes:
+    """The same lines with one separator between columns and nothing else, where that can be said of all at once."""
+    text, mark = text.replace(b"\r\n", b"\n").replace(b"\t", b" "), form.separator.encode()
+    if mark != b" ":
+        return text.replace(mark + b" ", mark).replace(b" " + mark, mark)
+    while b"  " in text:
+        text = text.replace(b"  ", b" ")
+    return text.replace(b"\n ", b"\n").replace(b" \n", b"\n").removeprefix(b" ")
+
+
+def _plain(text: bytes, form: Form) -> Events | None:
     """Lines of digits like `1.234567 12 34 1`, all at once, twice as fast as np.loadtxt; None where one line is of another form."""
+    if not text or (form.decimal and form.unit != SECONDS):
+        return None
     digit = np.frombuffer(text, np.uint8) - np.uint8(48)
-    found = _between(digit, BETWEEN[b"\r\n" in text[:LONGEST]])
+    found = _between(digit, form, b"-" in text)
     if found is None:
         return None
-    dot, *end, last = found
-    first = np.concatenate([[0], last[:-1] + 1])
-    starts = [first, *(before + 1 for before in end[:3])]
-    widths = [stop - start for start, stop in zip(starts, [dot, *end[1:]], strict=True)]
-    if any(width.min() < 1 for width in [*widths, end[0] - dot - 1]) or any(w.max() > most for w, most in zip(widths, MOST, strict=True)):
+    dot, starts, ends = found
+    first = dict(zip("txyp", (starts[column] for column in form.order), strict=True))
+    last = dict(zip("txyp", (ends[column] for column in form.order), strict=True))
+    after = last["t"]
+    if form.decimal:
+        last["t"] = dot
+    width = {name: last[name] - first[name] for name in "txyp"}
+    most = MOST | ({} if form.decimal else {"t": 19})
+    if any(w.min() < 1 or w.max() > most[name] for name, w in width.items()) or (form.decimal and (after - dot).min() < 2):
         return None
-    x, y, p = (_whole(digit, width, stop, np.int32) for width, stop in zip(widths[1:], end[1:], strict=True))
+    x, y, p = (_whole(digit, width[name], last[name], np.int32) for name in "xyp")
     if max(x.max(), y.max()) > 65535 or p.max() > 1:
         return None
-    t = _whole(digit, widths[0], dot, np.int64) * 1_000_000 + _millionths(digit, dot, end[0])
+    if b"-" in text:
+        p[digit.take(first["p"] - 1, mode="wrap") == DASH] = 0
+    t = _whole(digit, width["t"], last["t"], np.int64)
+    if form.decimal:
+        t = t * 1_000_000 + _millionths(digit, dot, after)
+    elif t.min() < 0 or t.max() > (LATEST - 1) / form.unit:
+        return None
+    elif form.unit < 1:
+        t = (t + form.unit.denominator // 2) // form.unit.denominator
+    else:
+        t = t * int(form.unit)
     return Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
 
 
-def _between(digit: np.ndarray, marks: bytes) -> list[np.ndarray] | None:
-    """Where the dots, the blanks after seconds, column and row, the ends of the polarities and the line feeds are: six rows.
+def _between(digit: np.ndarray, form: Form, signed: bool) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]] | None:
+    """Where the dots of the times are, and where each column begins and ends.
 
-    None where anything but these marks stands between the digits of a line.
+    None where anything but separators, dots, line feeds and the minus of a polarity is between digits.  signed: there is a minus
     """
+    marks = form.separator.join("." if form.decimal and column == form.order[0] else "" for column in range(form.columns)) + "\n"
     other = np.flatnonzero(digit > 9)
+    minus = other[digit.take(other) == DASH] if signed else other[:0]
+    if len(minus):
+        other = other[digit.take(other) != DASH]
     if len(other) % len(marks):
         return None
     place = list(other.reshape(-1, len(marks)).T.copy())
-    if any((digit.take(row) != (mark - 48) % 256).any() for row, mark in zip(place, marks, strict=True)):
+    if any((digit.take(row) != (ord(mark) - 48) % 256).any() for row, mark in zip(place, marks, strict=True)):
         return None
-    if len(marks) > 5 and (place[5] != place[4] + 1).any():
-        return None
-    return [*place[:5], place[-1]]
+    dot = place[marks.index(".")] if form.decimal else place[0]
+    ends = [row for row, mark in zip(place, marks, strict=True) if mark != "."]
+    starts = [np.concatenate([[0], place[-1][:-1] + 1]), *(end + 1 for end in ends[:-1])]
+    polarity = form.order[3]
+    if signed:
+        dark = digit.take(starts[polarity]) == DASH
+        if dark.sum() != len(minus):
+            return None
+        starts[polarity] = starts[polarity] + dark
+    return dot, starts, ends
 
 
 def _whole(digit: np.ndarray, width: np.ndarray, end: np.ndarray, dtype: type[np.signedinteger]) -> np.ndarray:
@@ -188,39 +271,49 @@ def _millionths(digit: np.ndarray, dot: np.ndarray, end: np.ndarray) -> np.ndarr
     return value + ((digit.take(dot + 7, mode="clip") >= 5) & (width >= 7)) if most >= 7 else value
 
 
-def _by_line(text: bytes, line: int, file: Member) -> Events:
+def _by_line(text: bytes, line: int, file: Member, form: Form) -> Events:
     """Events line by line, from line number `line` on, with comments, exponents, minus signs; the first line that is wrong is named."""
     rows = []
     for number, raw in enumerate(text.decode("ascii", "backslashreplace").split("\n"), line):
         row = raw.strip()
         if row and not row.startswith("#"):
             try:
-                rows.append(_row(row))
+                rows.append(_row(row, form))
             except ValueError as error:
-                remedy = f"a line is {FORM}; to drop this one: {_dropping(file, str(number))}"
+                remedy = f"a line is {_told(form)}; to drop this one: {_dropping(file, str(number))}"
                 raise DataError(str(file), f"{error}: {_quoted(row)}", remedy, f"line {number}") from error
     t, x, y, p = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Events(np.array(t, np.int64), np.array(x, np.uint16), np.array(y, np.uint16), np.array(p, np.uint8))
 
 
-def _row(row: str) -> tuple[int, int, int, int]:
+def _row(row: str, form: Form) -> tuple[int, int, int, int]:
     """One event, t in µs; ValueError says what is wrong."""
-    columns = row.split()
-    if len(columns) != 4:
-        raise ValueError(f"{len(columns)} columns instead of 4")
+    columns = form.split(row)
+    if len(columns) != form.columns:
+        raise ValueError(f"{len(columns)} columns instead of {form.columns}")
+    columns = [columns[i] for i in form.order]
     for column in columns:
         if column.lower().lstrip("+-") in ("nan", "inf", "infinity"):
             raise ValueError(f"{column} is no measurement")
         if not NUMBER.fullmatch(column):
             raise ValueError(f"{_quoted(column)} is not a number")
     t, x, y, p = map(float, columns)
-    if not abs(t * 1e6) < LATEST:
-        raise ValueError(f"{columns[0]} is no time in seconds")
+    if not abs(t * float(form.unit)) < LATEST:
+        raise ValueError(f"{columns[0]} is no time in {'seconds' if form.unit == SECONDS else 'its unit'}")
     if not (x.is_integer() and y.is_integer() and 0 <= x <= 65535 and 0 <= y <= 65535):
         raise ValueError(f"({columns[1]}, {columns[2]}) is no pixel")
     if p not in (-1, 0, 1):
         raise ValueError(f"polarity {columns[3]} is neither 0 nor 1")
-    return round(t * 1e6), int(x), int(y), int(p > 0)
+    micro = round(t * 1e6) if form.unit == SECONDS else floor(Fraction(columns[0]) * form.unit + Fraction(1, 2))
+    return micro, int(x), int(y), int(p > 0)
+
+
+def _told(form: Form) -> str:
+    """What a line should look like."""
+    if form == replace(Form(), line=form.line, skip=form.skip, sensor=form.sensor):
+        return FORM
+    names = [next((name for name, column in zip("txyp", form.order, strict=True) if column == i), "-") for i in range(form.columns)]
+    return f"{form.separator.join(names)}, as the first lines are"
 
 
 def _quoted(text: str) -> str:
