@@ -1,8 +1,8 @@
 """Benchmark tables: scripts/run python scripts/bench.py [--recording REC] [--device cpu] [--json FILE]
 
-(a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) memory;
-(e) what the device can do at best, measured in the same run.  Ratios within one run are to be trusted; absolute times depend on the
-machine and on who else works on it.
+(a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) reading files;
+(e) memory; (f) what the device can do at best, measured in the same run.  Ratios within one run are to be trusted; absolute times
+depend on the machine and on who else works on it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchcmax import __version__, kernels
@@ -34,7 +35,7 @@ from torchcmax.core.model import MODELS, Planar
 from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.window import Window
 from torchcmax.folder import writing
-from torchcmax.io import DataNote, Recording, open
+from torchcmax.io import DataNote, Events, OpenOptions, Recording, open, save
 from torchcmax.simulator import Simulation, write
 
 Table = list[dict[str, object]]
@@ -205,6 +206,31 @@ def used(device: str) -> float:
     return next((float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM")), float("nan"))
 
 
+def reading(recording: Recording, folder: Path, count: int = 1_000_000) -> Table:
+    """Mega-events a second that each form of the same events is read at, checks included, on one core."""
+    once = Events.join(list(recording.chunks()))
+    span = int(once.t[-1] - once.t[0]) + 1
+    turns = -(-count // len(once))
+    events = Events.join([replace(once, t=once.t - once.t[0] + turn * span) for turn in range(turns)])
+    table = np.stack([events.t, events.x, events.y, events.p], 1).astype(np.int64)
+    files = {"text, t x y p in s": "s.txt", "text, t,x,y,p in us": "us.csv", "npz": "events.npz", "DAT": "events.dat", "ours": "ours.h5"}
+    np.savetxt(folder / files["text, t,x,y,p in us"], table, "%d", ",", header="t_us,x,y,p", comments="")
+    seconds = (f"{t // 1_000_000}.{t % 1_000_000:06d} {x} {y} {p}\n" for t, x, y, p in table.tolist())
+    (folder / files["text, t x y p in s"]).write_text("".join(seconds))
+    np.savez(folder / files["npz"], t=events.t, x=events.x, y=events.y, p=events.p)
+    height, width = recording.camera.size
+    words = np.stack([events.t, events.x.astype(np.int64) | events.y.astype(np.int64) << 14 | events.p.astype(np.int64) << 28], 1)
+    head = f"% Version 2\n% Width {width}\n% Height {height}\n".encode()
+    (folder / files["DAT"]).write_bytes(head + bytes([12, 8]) + words.astype("<u4").tobytes())
+    options = OpenOptions(camera="pinhole", sensor=(width, height))
+    save(open(folder / files["npz"], options), folder / files["ours"])
+    rows: Table = []
+    for name, file in files.items():
+        taken, _ = best(lambda file=file: sum(map(len, open(folder / file, options).chunks())), "cpu", 3)  # type: ignore[misc]
+        rows.append({"form": name, "MB": round((folder / file).stat().st_size * 1e-6, 1), "Mev/s": round(len(events) / taken * 1e-6, 1)})
+    return rows
+
+
 def limits(recording: Recording, window: Window, device: str) -> Table:
     """(e) Copying, and torch adding to four pixels of an image for each event; and how we compare, reading events twice an evaluation."""
     canvas, model = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx)
@@ -258,7 +284,7 @@ def printed(title: str, rows: Table) -> None:
         print("| " + " | ".join(str(row.get(name, "")) for name in columns) + " |")
 
 
-def tables_of(recordings: list[Recording], windows: int, device: str, threads: list[int]) -> dict[str, Table]:
+def tables_of(recordings: list[Recording], folder: Path, windows: int, device: str, threads: list[int]) -> dict[str, Table]:
     """All tables, by their titles."""
     first = next(recordings[0].windows(30000, batch=windows)).to(device, torch.float32)
     load_kernels(device)
@@ -268,6 +294,7 @@ def tables_of(recordings: list[Recording], windows: int, device: str, threads: l
         tables[f"A cold window of 30,000 events of {recording.name}"] = cold_windows(recording, window, device)
     for recording in recordings:
         tables[f"The whole of {recording.name}"] = whole_recording(recording, device, threads)
+    tables["Reading, one core"] = reading(recordings[0], folder)
     tables["Memory"] = memory(recordings[0], device)
     tables["What the device can do"] = limits(recordings[0], first, device)
     return tables
@@ -292,7 +319,7 @@ def main() -> int:
         if not options.recording:
             write(Simulation(duration=0.5), Path(folder) / "poster")
         recordings = [open(name) for name in options.recording or [Path(folder) / "poster"]]
-        about, tables = machine(options.device), tables_of(recordings, options.windows, options.device, threads)
+        about, tables = machine(options.device), tables_of(recordings, Path(folder), options.windows, options.device, threads)
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     for title, rows in tables.items():
         printed(title, rows)
