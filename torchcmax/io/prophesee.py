@@ -25,6 +25,9 @@ SIZES = {  # px of the sensors that old headers name only by the plugin of the c
 }  # fmt: skip
 WANTS = "a RAW file's header names its format: % evt 2.0, 2.1 or 3.0, or % format EVT2, EVT21 or EVT3"
 AGAIN = "copy or record the file again"
+EVT3_WORDS = 1 << 15  # taken apart at once
+IS_EVENT = np.array([0, 0, 1, 0, 1, 1, *[0] * 10], np.uint8)  # of EVT3's kinds of words: a single event, a vector of 12, of 8
+STEPS = np.array([0, 0, 0, 0, 12, 8, *[0] * 10], np.uint8)  # columns that its vectors pass
 
 
 @dataclass
@@ -201,44 +204,45 @@ def evt21_legacy(word: np.ndarray, gate: Gate) -> Events:
 
 def evt3(word: np.ndarray, gate: Gate) -> Events:
     """16 bits: kind 4; a state of time, row and column is told word by word, and events are single columns or vectors of 12 and 8."""
+    parts = [_evt3(word[i : i + EVT3_WORDS], gate) for i in range(0, len(word), EVT3_WORDS)]
+    return Events.join(parts) if len(parts) > 1 else parts[0]
+
+
+def _evt3(word: np.ndarray, gate: Gate) -> Events:
+    """Some words, few enough for the processor's cache."""
     rest = gate.rest
     carried = np.array([0x6000 | rest.get("low", 0), rest.get("row", 0), 0x3000 | rest.get("base", 0)], "<u2")
     word = np.concatenate([carried, word])
     kind, value = (word >> 12).astype(np.uint8), word & np.uint16(0xFFF)
-    vector = (kind & 0xFE) == 4
-    source = np.flatnonzero((kind == 2) | vector)  # words that are events
-    low, row, base = (value[kind == k][_before(kind == k, source) - 1] for k in (6, 0, 3))
-    start = _unrolled_from(gate, value[kind == 8])[_before(kind == 8, source)]
-    flags, single = value[source], ~vector[source]
+    told = IS_EVENT.take(kind)
+    passed = np.cumsum(told, dtype=np.int32)  # events up to each word
+
+    def state(here: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """What was told last, at each event: the words that tell it, and what they tell, with that before the first of them."""
+        known: np.ndarray = np.repeat(values, np.diff(passed[here], prepend=0, append=passed[-1]))
+        return known
+
+    places = {k: np.flatnonzero(kind == k) for k in (6, 0, 3, 8)}
+    low, row, base = (state(places[k][1:], value[places[k]]) for k in (6, 0, 3))
+    start = state(places[8], _unrolled_from(gate, value[places[8]]))
+    steps = STEPS.take(kind)
+    columns = np.cumsum(steps, dtype=np.int32)  # that vectors passed up to each word, and with it
+    source = np.flatnonzero(told.view(bool))
+    flags, single = value[source], kind[source] == 2
+    ahead = columns[source] - steps[source] - state(places[3][1:], columns[places[3]])
+    x = np.where(single, flags & 0x7FF, (base & 0x7FF) + ahead.astype(np.uint16))
+    p = (np.where(single, flags, base) >> 11).astype(np.uint8)
     flags[kind[source] == 5] &= 0xFF
-    ahead, position = _passed(kind, value, source)
-    x, p, t = np.where(single, flags & 0x7FF, (base & 0x7FF) + ahead), np.where(single, flags, base) >> 11, (start << 12) + low
-    rows, bits = np.nonzero(np.unpackbits(flags[~single].view(np.uint8), bitorder="little").reshape(-1, 16))
-    many = np.ones(len(source), np.int64)
-    many[~single] = np.bincount(rows, minlength=len(source) - int(single.sum()))
-    which = np.repeat(np.arange(len(source)), many)
-    columns: list[np.ndarray] = [x, row & 0x7FF, p.astype(np.uint8), t]
-    x, y, p, t = (part.take(which) for part in columns)
-    x[~single.take(which)] += bits.astype(np.uint16)
+    flags[single] = 1
+    bit = np.flatnonzero(np.unpackbits(flags.view(np.uint8), bitorder="little").view(bool))  # of bytes it takes four times as long
+    which = bit >> 4
     gate.unknown += int(np.bincount(kind, minlength=16)[[1, 9, 11, 12, 13]].sum())
-    low_end, row_end, base_end = (int(value[np.flatnonzero(kind == k)[-1]]) for k in (6, 0, 3))
-    gate.rest = {"low": low_end, "row": row_end, "base": base_end & 0x800 | min(position, 0x7FF)}
-    return _kept(t, (x, y, p), gate)
-
-
-def _before(here: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """How many words of a kind stand before each event."""
-    count: np.ndarray = np.cumsum(here, dtype=np.int32)[source]
-    return count
-
-
-def _passed(kind: np.ndarray, value: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, int]:
-    """Columns that vectors have passed since their base, at each event; and the column where the next vector begins."""
-    steps = np.array([0, 0, 0, 0, 12, 8, *[0] * 10], np.uint8)[kind]
-    after = np.cumsum(steps, dtype=np.int32)
-    bases = np.flatnonzero(kind == 3)
-    ahead = after[source] - steps[source] - after[bases][_before(kind == 3, source) - 1]
-    return ahead.astype(np.uint16), (int(value[bases[-1]]) & 0x7FF) + int(after[-1] - after[bases[-1]])
+    last = places[3][-1]
+    position = (int(value[last]) & 0x7FF) + int(columns[-1] - columns[last])  # where the next vector begins
+    gate.rest = {"low": int(value[places[6][-1]]), "row": int(value[places[0][-1]])}
+    gate.rest["base"] = int(value[last]) & 0x800 | min(position, 0x7FF)
+    t = (start << 12) + low
+    return _kept(t[which], (x[which] + (bit & 15).astype(np.uint16), (row & 0x7FF)[which], p[which]), gate)
 
 
 def dat(word: np.ndarray, gate: Gate) -> Events:
