@@ -144,6 +144,28 @@ def test_wrong_usage_is_said_before_any_work(demo, tmp_path, capsys, words, mess
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.parametrize("name", ["calib.yaml", "camchain-a.yaml", "camera_info.yaml", "groundtruth.txt", "a_gt.hdf5"])
+def test_what_lies_beside_a_file_belongs_to_it(tmp_path, name):
+    (tmp_path / "a.raw").write_text("% evt 3.0")
+    (tmp_path / "notes.txt").write_text("nothing")
+    alone = job.fingerprint(tmp_path / "a.raw")
+    assert list(alone[1]) == ["a.raw"]
+    (tmp_path / name).write_text("1")
+    one = job.fingerprint(tmp_path / "a.raw")
+    (tmp_path / name).write_text("2")
+    assert len({alone[0], one[0], job.fingerprint(tmp_path / "a.raw")[0]}) == 3
+
+
+def test_texts_of_events_are_found_and_others_are_not(tmp_path):
+    (tmp_path / "events.csv").write_text("t_us,x,y,p\n1,2,3,0\n")
+    (tmp_path / "a.txt").write_text("0.1 96 133 0\n0.2 96 133 1\n")
+    for name, text in {"groundtruth.txt": "0 0 0 0 0 0 0 1\n", "images.txt": "0.1 1 1 1\n", "notes.csv": "name,age\nA,3\n"}.items():
+        (tmp_path / name).write_text(text)
+    recordings, skipped = batch.found([str(tmp_path)], tmp_path / "out")
+    assert [path.name for path in recordings] == ["a.txt", "events.csv"]
+    assert [path.name for path in skipped] == ["groundtruth.txt", "images.txt", "notes.csv"]
+
+
 def test_a_folder_that_is_being_written_to_is_not_taken(tmp_path):
     from torchcmax.io import DataError
 
@@ -294,5 +316,5 @@ def test_all_recordings_at_hand_are_done_by_two_workers(shared, tmp_path, capsys
     words = ("--task", "compensate", "--set", "limit=1", "--set", "events=10000", "--set", "camera=pinhole", "--set", "images=0")
     status, said, err = run(capsys, shared / "data", *words, "--out", tmp_path / "out", "--workers", 2, "--quiet")
     assert status == 0, said + err
-    assert len(manifests(tmp_path / "out")) == 21
+    assert len(manifests(tmp_path / "out")) == 22  # with the decoded events of evt3.raw, which are a recording too
     assert whole(tmp_path / "out")

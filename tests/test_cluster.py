@@ -48,3 +48,20 @@ def test_an_address_where_no_cluster_answers_is_wrong_usage(demo, tmp_path, caps
     status, _, err = run(capsys, demo, *LONG, "--out", tmp_path / "o", "--address", "auto", "--quiet")
     assert status == 2
     assert "no Ray cluster answers" in err
+
+
+def test_every_file_of_the_jobs_is_asked_for(tmp_path):
+    from torchcmax.cluster import _files, _seen
+    from torchcmax.job import Job
+
+    for name in ("a.raw", "c.yaml", "lens.yaml", "word"):
+        (tmp_path / name).write_text("hello")
+    config = {"camera": "lens.yaml", "map": None}
+    options = (f"--config={tmp_path}/c.yaml", "--limit=2")
+    jobs = [
+        Job(i, "track", tmp_path / f"{x}.raw", x, tmp_path, x, {}, options, config, "", "", home=str(tmp_path)) for i, x in enumerate("ab")
+    ]
+    files = _files(jobs)
+    assert [file.rpartition("/")[2] for file in files] == ["a.raw", "b.raw", "lens.yaml", "c.yaml"]
+    assert _seen(str(tmp_path / "word"), files) == ("hello", [str(tmp_path / "b.raw")])
+    assert _seen(str(tmp_path / "nothing"), []) == ("", [])

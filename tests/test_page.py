@@ -264,6 +264,18 @@ def test_report_makes_the_pages_again_of_results_and_of_a_batch_with_all_its_res
     assert capsys.readouterr().out.splitlines() == [f"report: {alone}/report.html", f"report: {tmp_path}/report.html"]
 
 
+def test_a_broken_result_is_told_and_stops_no_other_page(tmp_path, capsys):
+    batch(tmp_path)
+    for page in tmp_path.glob("*/report.html"):
+        page.unlink()
+    (tmp_path / "poster 1" / "summary.json").write_text("{")
+    assert report.run(report.build().parse_args([str(tmp_path)])) == 1
+    out, err = capsys.readouterr()
+    assert "poster 1/summary.json: cannot be read" in err
+    assert out == f"report: {tmp_path}/report.html\n"
+    assert [page.parent.name for page in tmp_path.glob("*/report.html")] == ["poster 2"]
+
+
 def test_report_of_a_folder_without_a_run_is_an_error(tmp_path):
     with pytest.raises(DataError, match=r"has no summary\.json"):
         report.run(report.build().parse_args([str(tmp_path)]))

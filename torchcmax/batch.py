@@ -21,13 +21,15 @@ import h5py
 from torchcmax.config import UsageError
 from torchcmax.folder import PAGE, SUMMARY, versions, writing
 from torchcmax.io import DataError
+from torchcmax.io.opening import HEAD, OTHERS, TEXTS
+from torchcmax.io.text import like_text
 from torchcmax.job import FAILED, MANIFEST, RUNNING, Job, Manifest, fingerprint, numbers, read_manifest, stamps
 
 LOCK, TABLE, ALL = ".lock", "batch.csv", "batch.json"
 INSIDE = ("events.h5", "events.txt")  # a folder with one of these is a recording
 HEADS = {  # how the files begin that are recordings by themselves
-    ".h5": b"\x89HDF", ".hdf5": b"\x89HDF", ".zip": b"PK", ".npz": b"PK", ".raw": b"% ", ".dat": b"% ", ".aedat4": b"#!AER-DAT4",
-    ".es": b"Event Stream", ".bag": b"#ROSBAG V2",
+    ".h5": b"\x89HDF", ".hdf5": b"\x89HDF", ".zip": b"PK", ".npz": b"PK", ".npy": b"\x93NUMPY", ".raw": b"% ", ".dat": b"% ",
+    ".aedat4": b"#!AER-DAT4", ".es": b"Event Stream", ".bag": b"#ROSBAG V2",
 }  # fmt: skip
 AGAIN = "give another --out, or --again to replace it"
 
@@ -83,8 +85,11 @@ def is_recording(file: Path) -> bool:
     head = HEADS.get(file.suffix.lower())
     try:
         with file.open("rb") as stream:
-            if head is None or not stream.read(16).startswith(head):
-                return False
+            first = stream.read(HEAD)
+        if file.suffix in TEXTS:
+            return file.name not in OTHERS and like_text(first)
+        if head is None or not first.startswith(head):
+            return False
         return not head.endswith(b"HDF") or _names_events(file)
     except OSError:
         return head is not None  # it will say so when it is opened

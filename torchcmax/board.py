@@ -37,6 +37,14 @@ class Board:
         """One number for each name, at a window."""
         self._write(summary={"value": [{"tag": name, "simple_value": value} for name, value in values.items()]}, step=step)
 
+    def hparams(self, settings: Mapping[str, str], results: Mapping[str, float]) -> None:
+        """A line in the table of hyperparameters: what was set, and what came out."""
+        from torch.utils.tensorboard.summary import hparams  # 0.5 s, so only over a sweep
+
+        for part in hparams(dict(settings), dict.fromkeys(results, 0.0)):
+            self._write(summary=part)
+        self.scalars(results, 0)
+
     def curve(self, name: str, values: Tensor) -> None:
         """One number for each evaluation: values [T]."""
         for step, value in enumerate(values[values.isfinite()].tolist()):

@@ -39,7 +39,7 @@ def distributed(jobs: Sequence[Job], cluster: Cluster, begin: Callable[[Job], No
         return
     ray = _ray()
     with _connected(ray, cluster.address):
-        _check_shared(ray, jobs[0].out)
+        _check_shared(ray, jobs[0].out, _files(jobs))
         if cluster.gpu and not ray.cluster_resources().get("GPU"):
             raise UsageError(f"--device cuda: the Ray cluster at {cluster.address} has no GPU; take --device cpu")
         remote = ray.remote(work).options(num_cpus=1, num_gpus=1 if cluster.gpu else 0, max_retries=cluster.retries, name="torchcmax")
@@ -83,8 +83,18 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
             ray.shutdown()
 
 
-def _check_shared(ray: Any, out: Path) -> None:
-    """Every machine of the cluster sees the folder of the results: each is asked for the word in a file there."""
+def _files(jobs: Sequence[Job]) -> list[str]:
+    """The recordings of jobs, and the files that their options name."""
+    files = dict.fromkeys(str(job.recording) for job in jobs)
+    for job in jobs:
+        named = [job.config.get("camera") or "pinhole", job.config.get("map") or "pinhole"]
+        named += [option.removeprefix("--config=") for option in job.options if option.startswith("--config=")]
+        files |= dict.fromkeys(str(Path(job.home, name)) for name in named if name != "pinhole")
+    return list(files)
+
+
+def _check_shared(ray: Any, out: Path, files: list[str]) -> None:
+    """Every machine of the cluster sees the folder of the results, where each is asked for the word in a file, and the jobs' files."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     word, file = uuid.uuid4().hex, out / RUNNING / "word"
@@ -94,24 +104,29 @@ def _check_shared(ray: Any, out: Path) -> None:
     asked = {}
     for one in nodes:
         there = NodeAffinitySchedulingStrategy(one, soft=False)
-        asked[look.options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote(str(file))] = one
+        asked[look.options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote(str(file), files)] = one
     for task, node in asked.items():
         try:
-            seen = ray.get(task, timeout=REPLY)
+            seen, lacking = ray.get(task, timeout=REPLY)
         except ray.exceptions.RayError as error:
             remedy = "see that torchcmax is installed there, in the same version of Python, and that Ray works"
             raise DataError(out, f"the machine {nodes[node]} of the cluster does not answer: {_first_line(error)}", remedy) from error
         if seen != word:
             remedy = f"give an --out on a file system that all machines share, by the same name as on {platform.node()}"
             raise DataError(out, f"is not seen from {nodes[node]}, a machine of the cluster", remedy)
+        if lacking:
+            more = f", nor are {len(lacking) - 1} others" if len(lacking) > 1 else ""
+            remedy = f"put it on a file system that all machines share, by the same name as on {platform.node()}"
+            raise DataError(lacking[0], f"is not seen from {nodes[node]}, a machine of the cluster{more}", remedy)
 
 
-def _seen(file: str) -> str:
-    """What a file holds, as seen from here; empty: it is not there."""
+def _seen(file: str, others: list[str]) -> tuple[str, list[str]]:
+    """What a file holds, as seen from here, empty where it is not there; and which others are not there."""
+    lacking = [other for other in others if not Path(other).exists()]
     try:
-        return Path(file).read_text()
+        return Path(file).read_text(), lacking
     except OSError:
-        return ""
+        return "", lacking
 
 
 def _most(ray: Any, cluster: Cluster) -> int:

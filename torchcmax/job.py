@@ -24,12 +24,13 @@ from torchcmax import __version__
 from torchcmax.board import Board
 from torchcmax.folder import SUMMARY, versions
 from torchcmax.io import DataError
+from torchcmax.io.opening import LENSES, TRUTHS
 
 TASKS = ("compensate", "track", "panorama")
 LINE = "torchcmax.cli"  # its main() does the work; it stands above this file, so it is imported when it is called
 RUNNING, FAILED, MANIFEST, LOG = ".running", ".failed", "manifest.json", "log.txt"
 UNEXPECTED = 70  # exit of a job that ended in a traceback
-BESIDE = ("calib.txt", "groundtruth.txt", "plane.txt", "images.txt")  # what belongs to a recording that is one file
+BESIDE = (*LENSES, "groundtruth.txt", "plane.txt", "images.txt", *(f"*{end}" for end in TRUTHS))  # what belongs to one that is a file
 DATA = frozenset(".txt .csv .tsv .yaml .yml .json .h5 .hdf5 .hdf .npz .npy .zip .gz .raw .dat .aedat4 .es .bag".split())
 TOO_DEEP = ("config", "versions", "files")  # of summary.json: no numbers of the result
 
@@ -136,7 +137,7 @@ def stamps(recording: Path) -> dict[str, list[int]]:
     if recording.is_dir():
         paths = [path for path in recording.iterdir() if path.suffix.lower() in DATA and not path.name.startswith(".") and path.is_file()]
     else:
-        beside = [recording.with_name(name) for name in BESIDE]
+        beside = {path for name in BESIDE for path in recording.parent.glob(name)}
         paths = [recording, *(path for path in beside if path != recording and path.is_file())]
     return {path.name: [path.stat().st_size, path.stat().st_mtime_ns] for path in sorted(paths)}
 
@@ -276,13 +277,9 @@ def _flat(values: dict[str, Any], before: str = "") -> Iterator[tuple[str, float
 
 def show_settings(folder: Path, settings: dict[str, str]) -> None:
     """Tell TensorBoard's table of hyperparameters what was swept and what came out, in the run's own folder."""
-    from torch.utils.tensorboard.summary import hparams  # 0.5 s, so only over a sweep
-
     found = {f"result/{name.replace('.', '/')}": value for name, value in numbers(folder).items()}
     board = Board(folder)
     try:
-        for part in hparams(dict(settings), dict.fromkeys(found, 0.0)):
-            board._write(summary=part)
-        board.scalars(found, 0)
+        board.hparams(settings, found)
     finally:
         board.close()

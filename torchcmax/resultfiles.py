@@ -101,11 +101,16 @@ def finished(path: Path) -> list[Path]:
     """The results of a batch that came to their end; of any other path, the path."""
     if not inside(path, BATCH):
         return [path]
-    rows = read_json(path, BATCH).get("results")
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise DataError(path / BATCH, "has no list of results", AGAIN)
-    places = [inside(path, str(row.get("folder", ""))) for row in rows if row.get("exit") == 0]
+    places = [inside(path, str(row.get("folder", ""))) for row in batch_rows(path) if row.get("exit") == 0]
     return [place for place in places if place is not None and place.resolve() != path.resolve()]
+
+
+def batch_rows(folder: Path) -> list[dict[str, Any]]:
+    """The manifests of a batch's results."""
+    rows = read_json(folder, BATCH).get("results")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and isinstance(row.get("settings", {}), dict) for row in rows):
+        raise DataError(folder / BATCH, "has no list of results", AGAIN)
+    return rows
 
 
 def inside(folder: Path, name: str) -> Path | None:

@@ -66,7 +66,21 @@ def test_an_equidistant_lens_is_kannala_brandt(tmp_path: Path) -> None:
     assert (lens.model, lens.distortion) == ("kannala_brandt", (-0.3, 0.1, 0.01, 0.02))
 
 
-@pytest.mark.parametrize("text", [KALIBR.format(model="fov"), "distortion_model: rational_polynomial\n" + MATRIX.format(tag="")])
+@pytest.mark.parametrize("text", [KALIBR.format(model="fov"), KALIBR.format(model="rational_polynomial")])
 def test_another_distortion_is_refused_with_what_is_supported(tmp_path: Path, text: str) -> None:
     with pytest.raises(DataError, match="supported"):
         read(tmp_path, text)
+
+
+def test_a_rational_polynomial_without_its_last_terms_is_plumb_bob(tmp_path: Path) -> None:
+    text = "distortion_model: rational_polynomial\n" + MATRIX.format(tag="")
+    assert holds_the_numbers(read(tmp_path, text))
+    longer = text.replace("cols: 5\n  data: [-0.3, 0.1, 0.01, 0.02, 0]", "cols: 8\n  data: [-0.3, 0.1, 0.01, 0.02, 0, 0, {}, 0]")
+    assert holds_the_numbers(read(tmp_path, longer.format("0")))
+    with pytest.raises(DataError, match="rational_polynomial"):
+        read(tmp_path, longer.format("0.1"))
+
+
+def test_a_model_that_nobody_names_is_told(tmp_path: Path) -> None:
+    with pytest.warns(DataNote, match="plumb_bob is taken"):
+        assert holds_the_numbers(read(tmp_path, MATRIX.format(tag="")))

@@ -7,6 +7,7 @@ from mutated import assert_safe
 from samples import a_trajectory
 
 from torchcmax.core import so3
+from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.io import DataError, DataNote, DataWarning, Events, OpenOptions, open
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="rosbags is an extra: pip install 'torchcmax[io]'")
@@ -22,13 +23,14 @@ def events(count=5000, start=1_600_000_000_000_000):
     )
 
 
-def write(path, found, topics=("/dvs/events",), kind="dvs_msgs", info=True, poses=None, compression=None):
-    """A bag of event arrays of 700 events each, with a calibration and poses."""
+def write(path, found, topics=("/dvs/events",), kind="dvs_msgs", info=True, poses=None, compression=None, frames=()):
+    """A bag of event arrays of 700 events each, with a calibration, poses, and frames: (parent, child, poses, topic) of tf."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(EVENT, f"{kind}/msg/Event"))
     store.register(get_types_from_msg(ARRAY.format(kind=kind), f"{kind}/msg/EventArray"))
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
     types = store.types
     time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
 
@@ -66,6 +68,18 @@ def write(path, found, topics=("/dvs/events",), kind="dvs_msgs", info=True, pose
             q = so3.to_quaternion(poses.pose.R)
             for t, p, r in zip(poses.time.tolist(), poses.pose.t.tolist(), q.tolist(), strict=True):
                 send(connection, types[name](head(t), pose(point(*p), quaternion(*r))), t, name)
+        connections = {}
+        for parent, child, poses, topic in frames:
+            name = "tf2_msgs/msg/TFMessage"
+            connections[topic] = connections.get(topic) or bag.add_connection(topic, name, typestore=store)
+            vector, quaternion, transform, one = (
+                types[f"geometry_msgs/msg/{one}"] for one in ("Vector3", "Quaternion", "Transform", "TransformStamped")
+            )
+            for t, p, r in zip(poses.time.tolist(), poses.pose.t.tolist(), so3.to_quaternion(poses.pose.R).tolist(), strict=True):
+                stamp = header(0, time(t // 10**6, t % 10**6 * 1000), parent)
+                message = types[name]([one(stamp, child, transform(vector(*p), quaternion(*r)))])
+                for _ in range(2):  # tf repeats itself
+                    send(connections[topic], message, t, name)
     return path
 
 
@@ -140,3 +154,28 @@ def test_a_message_that_claims_more_than_it_has_ends_the_reading_with_a_warning(
     (tmp_path / "b.bag").write_bytes(raw)
     with pytest.warns(DataWarning, match="is read up to event 700, and broken from there on"):
         same(read(tmp_path / "b.bag")[1], events(1400)[:700])
+
+
+def placed(poses, still=False):
+    """The same poses at times of the bag; still: all of them the first one."""
+    first = poses.pose[:1]
+    pose = Pose(first.R.expand_as(poses.pose.R), first.t.expand_as(poses.pose.t)) if still else poses.pose
+    return Trajectory(torch.arange(len(poses)) * 1000 + 1_600_000_000_000_000, pose)
+
+
+def test_the_only_frames_of_tf_that_move_are_the_truth(tmp_path):
+    poses = placed(a_trajectory())
+    fixed = placed(a_trajectory(), still=True)
+    frames = [("base", "camera", fixed, "/tf"), ("world", "base", poses, "/tf"), ("base", "lens", fixed, "/tf_static")]
+    with pytest.warns(DataNote, match="poses of tf, base in world, are taken"):
+        truth = open(write(tmp_path / "a.bag", events(), frames=frames), OpenOptions()).truth
+    assert torch.equal(truth.time, poses.time)
+    torch.testing.assert_close(truth.pose.t, poses.pose.t)
+    torch.testing.assert_close(truth.pose.R, poses.pose.R)
+
+
+def test_of_several_frames_of_tf_that_move_none_is_taken(tmp_path):
+    poses = placed(a_trajectory())
+    frames = [("world", "camera", poses, "/tf"), ("world", "hand", poses, "/tf")]
+    with pytest.warns(DataNote, match="camera in world, hand in world; none is taken"):
+        assert open(write(tmp_path / "a.bag", events(), frames=frames), OpenOptions()).truth is None

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from jsonargparse import Namespace
 
 from torchcmax.batchpage import write_batch_page
-from torchcmax.config import Parser, command
+from torchcmax.config import Parser, UsageError, command
 from torchcmax.io import DataError
 from torchcmax.page import write_page
-from torchcmax.resultfiles import AGAIN, inside, read_json
+from torchcmax.resultfiles import BATCH, batch_rows, finished, inside
 
 SUMMARY = "make report.html of results and batches again"
-ALL = "batch.json"
 
 
 def build() -> Parser:
     """Its options."""
     sub = command(
         "Make report.html again, from what is in folders that compensate, track, panorama or batch wrote. The page needs no network and "
-        "no other file. For a batch, the pages of all its finished results are made again too."
+        "no other file. For a batch, the pages of all its finished results are made again too; one that cannot be made is told, and "
+        "stops nothing."
     )
     sub.add_argument("folders", type=str, nargs="+", help="folders that compensate, track, panorama or batch wrote")
     return sub
@@ -28,19 +29,23 @@ def build() -> Parser:
 
 def run(config: Namespace) -> int:
     """torchcmax report"""
-    for name in config.folders:
-        folder = Path(name)
-        print(f"report: {_batch(folder) if name and inside(folder, ALL) else write_page(folder)}")
-    return 0
-
-
-def _batch(folder: Path) -> Path:
-    """The page of a batch, after those of its results."""
-    rows = read_json(folder, ALL).get("results")
-    if not isinstance(rows, list) or not all(isinstance(row, dict) and isinstance(row.get("settings", {}), dict) for row in rows):
-        raise DataError(folder / ALL, "has no list of results", AGAIN)
-    for row in rows:
-        place = inside(folder, str(row.get("folder", "")))
-        if row.get("exit") == 0 and place is not None and place.resolve() != folder.resolve():
-            write_page(place)
-    return write_batch_page(folder, rows)
+    folders = [Path(name) for name in config.folders if name]
+    if len(folders) < len(config.folders):
+        raise UsageError("a folder's name is empty")
+    failed = 0
+    for folder in folders:
+        alone = len(folders) == 1 and not inside(folder, BATCH)
+        for place in finished(folder):
+            try:
+                page = write_page(place)
+            except DataError as error:  # the others must be seen
+                if alone:
+                    raise
+                print(f"torchcmax report: {error}", file=sys.stderr)
+                failed += 1
+            else:
+                if place == folder:
+                    print(f"report: {page}")
+        if inside(folder, BATCH):
+            print(f"report: {write_batch_page(folder, batch_rows(folder))}")
+    return 1 if failed else 0

@@ -62,6 +62,10 @@ def _data(file: str, found: Mapping[str, Any], key: str) -> Any:
 def _ours(file: str, camera: Mapping[str, Any], focal: Any, distortion: Any) -> dict[str, Any]:
     """One camera in our words; its numbers are looked at by whoever takes them."""
     told = str(camera.get("distortion_model", "plumb_bob"))
+    if told == "rational_polynomial" and isinstance(distortion, list) and len(distortion) >= 5 and not any(distortion[5:]):
+        told, distortion = "plumb_bob", distortion[:5]  # without k4, k5, k6 it is the same
+    if "distortion_model" not in camera and isinstance(distortion, list) and any(distortion):
+        tell(DataNote(f"{file}: does not name its distortion_model, plumb_bob is taken"))
     if told not in DISTORTIONS or str(camera.get("camera_model", "pinhole")) != "pinhole":
         raise DataError(file, f"camera model {camera.get('camera_model', 'pinhole')} with distortion {told[:40]}", SUPPORTED)
     size = camera.get("resolution", [camera.get("image_width"), camera.get("image_height")])

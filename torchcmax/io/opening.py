@@ -42,6 +42,7 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (hdf5, prophesee, dv, rosbag, npz)
 HEAD = 4096  # bytes by which a file is known
+TRUTHS = ("_gt.hdf5", "_gt.h5")  # of MVSEC and M3ED, beside the events
 TEXTS = (".txt", ".csv")
 OTHERS = ("calib.txt", "groundtruth.txt", "plane.txt", "images.txt", "imu.txt", "velocity.txt")  # beside events, never events
 
@@ -104,7 +105,7 @@ def _folder(folder: Path, options: OpenOptions) -> Recording:
         return _binary(hdf5, folder / "events.h5", options, folder)
     if (folder / "events.txt").is_file():
         return _text(folder, folder / "events.txt", folder.resolve().name, options)
-    entries = sorted(entry for entry in folder.iterdir() if not entry.stem.endswith("_gt"))  # of MVSEC and M3ED: truth
+    entries = sorted(entry for entry in folder.iterdir() if not entry.name.endswith(TRUTHS))
     known = [(form, entry) for entry in entries if entry.is_file() and (form := _form(entry, _head(entry))) is not None]
     if len(known) == 1:
         return _binary(*known[0], options, folder)

@@ -27,7 +27,9 @@ EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p",
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 INFO = "sensor_msgs/msg/CameraInfo"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry")
+FRAMES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # of one form
 AGAIN = "copy or download it again; a bag that was not closed is mended by `rosbag reindex`"
+Row = tuple[int, float, float, float, float, float, float, float]  # µs, tx ty tz qx qy qz qw
 MOST = 1 << 31  # bytes of a message: more is a damaged length
 
 
@@ -138,9 +140,12 @@ def _events(path: Path, topic: str, chunk: int) -> Iterator[Events]:
 
 
 def _typestore() -> Any:
-    from rosbags.typesys import Stores, get_typestore
+    """How messages are laid out: those of ROS itself, and of tf."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", FRAMES[0]))
+    return store
 
 
 def _lens(path: Path, bag: Any, topic: str) -> Lens | None:
@@ -181,11 +186,11 @@ def _truth(path: Path, bag: Any) -> Trajectory | None:
     """The poses of the topic that has most, as camera to world; None where there is none."""
     found = {name: count for name, count in _topics(bag, POSES).items() if count > 1}
     if not found:
-        return None
+        return _frames(path, bag)
     topic = next(iter(found))
     kind = next(connection.msgtype for connection in bag.connections if connection.topic == topic)
     tell(DataNote(f"{path}: poses of {topic} are taken for the camera's"))
-    store, rows = _typestore(), []
+    store, rows = _typestore(), list[Row]()
     for data in _messages(bag, topic):
         told = store.deserialize_ros1(data, kind)
         stamp = told.header.stamp
@@ -195,6 +200,34 @@ def _truth(path: Path, bag: Any) -> Trajectory | None:
             pose = told.pose.pose if kind.endswith("Odometry") else told.pose
             p, q = pose.position, pose.orientation
         rows.append((stamp.sec * 1_000_000 + round(stamp.nanosec / 1000), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    return _trajectory(path, topic, rows)
+
+
+def _trajectory(path: Path, name: str, rows: list[Row]) -> Trajectory:
+    """Poses from rows of a time and its seven numbers."""
     time = np.array([row[0] for row in rows], np.int64)
     table = np.array([row[1:] for row in rows], np.float64)
-    return checked_trajectory(str(path), time, table[:, :3], table[:, 3:], lambda i: f"{topic}, pose {i + 1}")
+    return checked_trajectory(str(path), time, table[:, :3], table[:, 3:], lambda i: f"{name}, pose {i + 1}")
+
+
+def _frames(path: Path, bag: Any) -> Trajectory | None:
+    """The one pair of frames in tf that moves against each other, child to parent; None where none does, or nobody knows which it is."""
+    pairs: dict[tuple[str, str], list[Row]] = {}
+    topics = [topic for topic in _topics(bag, FRAMES) if not topic.endswith("static")]
+    for topic in topics:
+        store = _typestore()
+        for data in _messages(bag, topic):
+            for told in store.deserialize_ros1(data, FRAMES[0]).transforms:
+                stamp, p, q = told.header.stamp, told.transform.translation, told.transform.rotation
+                rows = pairs.setdefault((told.header.frame_id, told.child_frame_id), [])
+                row: Row = (stamp.sec * 1_000_000 + round(stamp.nanosec / 1000), p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+                if not rows or row[0] != rows[-1][0]:  # tf repeats what it has
+                    rows.append(row)
+    moving = {pair: rows for pair, rows in pairs.items() if len({row[1:] for row in rows}) > 1}
+    names = [f"{child} in {parent}" for parent, child in moving]
+    if len(moving) != 1:
+        if moving:
+            tell(DataNote(f"{path}: tf tells of {', '.join(names)}; none is taken for the camera's poses: give them as groundtruth.txt"))
+        return None
+    tell(DataNote(f"{path}: poses of tf, {names[0]}, are taken for the camera's"))
+    return _trajectory(path, f"tf, {names[0]}", next(iter(moving.values())))
