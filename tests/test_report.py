@@ -1,6 +1,7 @@
 import csv
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from torchcmax.board import Board
 from torchcmax.compensate import Compensation, compensate
 from torchcmax.core.camera import Canvas
 from torchcmax.core.warp import still
@@ -209,3 +211,27 @@ def test_tones_are_of_the_brightest_pixels_but_for_a_few():
     on[0, 0] = 1000
     picture = coloured(on, torch.zeros(20, 50))
     assert (picture[1:] == [255, 0, 0]).all()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_an_error_of_the_board_where_it_is_met(tmp_path):
+    board = Board(tmp_path)
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        board._file.close()
+        board._file = board._records._writer = full
+        with pytest.raises(OSError, match="No space left"):
+            board.scalars({"a": 1.0}, 0)
+
+
+def test_what_cannot_be_written_at_the_end_keeps_nothing_else_from_being_written(results, tmp_path, monkeypatch):
+    recording, options, parts = results
+
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Board, "close", full)
+    with pytest.raises(DataError, match="No space left"), Report(tmp_path, recording, options, "", 0) as written:
+        written.add(*parts[0])
+    assert json.loads((tmp_path / "summary.json").read_text())["windows"] == 3
+    assert (tmp_path / "windows.csv").is_file()
+    assert (tmp_path / "report.html").is_file()

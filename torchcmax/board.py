@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,18 +16,24 @@ from torch import Tensor
 class Board:
     """A log folder that `tensorboard --logdir` shows.  Steps are window numbers; curves have evaluations as steps.
 
-    Events go to TensorBoard's own writer as they are: a SummaryWriter would unpack and pack every picture again.
+    Events go to TensorBoard's own writer of records as they are: a SummaryWriter would unpack and pack every picture again, and write
+    in a thread of its own, where an error, as of a full disk, ends in a traceback and nobody hears of it.  Here it is an OSError.
     """
+
+    count = itertools.count()  # of boards that this process began
 
     def __init__(self, folder: Path) -> None:
         from tensorboard.compat.proto import event_pb2  # type: ignore[import-untyped]  # 0.1 s, so only when a board is wanted
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter  # type: ignore[import-untyped]
+        from tensorboard.summary.writer.record_writer import RecordWriter  # type: ignore[import-untyped]
 
-        self._event = event_pb2.Event
-        self._writer = EventFileWriter(str(folder), max_queue_size=1000)
+        name = f"events.out.tfevents.{int(time.time()):010d}.{platform.node()}.{os.getpid()}.{next(self.count)}"
+        folder.mkdir(parents=True, exist_ok=True)
+        self._event, self._file = event_pb2.Event, (folder / name).open("wb")
+        self._records = RecordWriter(self._file)
+        self._write(file_version="brain.Event:2")
 
     def _write(self, **content: Any) -> None:
-        self._writer.add_event(self._event(wall_time=time.time(), **content))
+        self._records.write(self._event(wall_time=time.time(), **content).SerializeToString())
 
     def config(self, text: str) -> None:
         """The run's configuration, YAML."""
@@ -57,8 +66,8 @@ class Board:
 
     def flush(self) -> None:
         """What was written can be seen."""
-        self._writer.flush()
+        self._file.flush()
 
     def close(self) -> None:
         """Everything is on disk afterwards."""
-        self._writer.close()
+        self._file.close()

@@ -7,8 +7,9 @@ import platform
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -74,12 +75,19 @@ def check_place(folder: Path, recording: Recording, names: tuple[str, ...] = ())
 def written(folder: Path) -> set[str]:
     """The files that an earlier run of ours left, so that a new run may take their place; nothing where its summary is not one of ours."""
     try:
-        summary = json.loads((folder / SUMMARY).read_text())
-        names = summary.get("files", [WINDOWS]) if "torchcmax" in summary["versions"] else None
-        ours = {name for name in names or () if name in (WINDOWS, *TRACKED, *TURNED) or MORE.fullmatch(name)}
-        return set() if names is None else {SUMMARY, PAGE, *EVALUATION} | ours
+        names = _ours(folder / SUMMARY).get("files", [WINDOWS])
+        ours = {name for name in names if name in (WINDOWS, *TRACKED, *TURNED) or MORE.fullmatch(name)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        ours |= set(EVALUATION) if _ours(folder / EVALUATION[0]) else set()
+    return {SUMMARY, PAGE} | ours
+
+
+def _ours(path: Path) -> dict[str, Any]:
+    """A JSON object that says which version of torchcmax wrote it; KeyError where it does not."""
+    found: dict[str, Any] = json.loads(path.read_text())
+    return found if found["versions"]["torchcmax"] else {}
 
 
 def clear(folder: Path) -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import time
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -20,7 +21,7 @@ from torchcmax.core.objective import REFERENCES
 from torchcmax.core.warp import still
 from torchcmax.core.window import Window
 from torchcmax.folder import COLUMNS, LIVE, SUMMARY, WHOLE, WINDOWS, cell, check_place, clear, unwritable, versions, writing
-from torchcmax.io import Recording
+from torchcmax.io import DataError, Recording
 from torchcmax.page import write_page
 from torchcmax.picture import captioned, pictures, png
 
@@ -122,16 +123,27 @@ class Report:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self.board is None:
             return
-        try:
-            self.board.close()
-            self._csv.close()
-            (self.folder / LIVE).replace(self.folder / WINDOWS)
-            with writing(self.folder / SUMMARY) as name:
-                name.write_text(json.dumps(self.summary(None if kind is None else f"{kind.__name__}: {error}"), indent=1) + "\n")
-            write_page(self.folder)
-        except OSError as full:
-            if error is None:  # else the first error is the one to tell
-                raise unwritable(self.folder, full) from full
+        stopped, failed = None if kind is None else f"{kind.__name__}: {error}", None
+        for last in (
+            self.board.close,
+            self._csv.close,
+            self._name_table,
+            partial(self._summarize, stopped),
+            lambda: write_page(self.folder),
+        ):
+            try:  # to keep all that there is, whatever of it cannot be written
+                last()
+            except (OSError, DataError) as full:
+                failed = failed or full
+        if failed is not None and error is None:  # else the first error is the one to tell
+            raise failed if isinstance(failed, DataError) else unwritable(self.folder, failed) from failed
+
+    def _name_table(self) -> None:
+        (self.folder / LIVE).replace(self.folder / WINDOWS)
+
+    def _summarize(self, stopped: str | None) -> None:
+        with writing(self.folder / SUMMARY) as name:
+            name.write_text(json.dumps(self.summary(stopped), indent=1) + "\n")
 
     def summary(self, stopped: str | None = None) -> dict[str, object]:
         """The run in numbers."""
