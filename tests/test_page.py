@@ -276,6 +276,16 @@ def test_a_broken_result_is_told_and_stops_no_other_page(tmp_path, capsys):
     assert [page.parent.name for page in tmp_path.glob("*/report.html")] == ["poster 2"]
 
 
+def test_a_broken_batch_stops_no_other_folder(tmp_path, capsys):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "batch.json").write_text("{")
+    alone = result(tmp_path / "b")
+    assert report.run(report.build().parse_args([str(tmp_path / "a"), str(alone)])) == 1
+    out, err = capsys.readouterr()
+    assert "a/batch.json: cannot be read" in err
+    assert out == f"report: {alone}/report.html\n"
+
+
 def test_report_of_a_folder_without_a_run_is_an_error(tmp_path):
     with pytest.raises(DataError, match=r"has no summary\.json"):
         report.run(report.build().parse_args([str(tmp_path)]))

@@ -86,7 +86,7 @@ def is_recording(file: Path) -> bool:
     try:
         with file.open("rb") as stream:
             first = stream.read(HEAD)
-        if file.suffix in TEXTS:
+        if file.suffix.lower() in TEXTS:
             return file.name not in OTHERS and like_text(first)
         if head is None or not first.startswith(head):
             return False

@@ -110,8 +110,58 @@ def test_what_may_be_read_in_two_ways_is_refused(tmp_path, lines, told):
     refused(tmp_path / "a.txt", told, "name the columns", camera="pinhole")
 
 
+@pytest.mark.parametrize("order", ["txyp", "xypt", "xytp", "tpxy"])
+@pytest.mark.parametrize("time", [lambda t: f"{t}.0", lambda t: f"{t:.18e}"])
+def test_decimal_times_that_are_whole_and_far_apart_are_microseconds(tmp_path, order, time):
+    """As np.savetxt writes integers that have become floating point."""
+    (tmp_path / "a.txt").write_text(written(rows(), order, time=time))
+    with pytest.warns(DataNote, match="whole numbers, and taken for us"):
+        same(read(tmp_path / "a.txt", camera="pinhole"), rows())
+
+
+@pytest.mark.parametrize("label", ["", "car"])
+def test_columns_that_are_no_numbers_change_no_unit(tmp_path, label):
+    (tmp_path / "a.csv").write_text(written(rows(), "txyp", separator=",", head="t,x,y,p,label\n", end=f",{label}\n"))
+    with pytest.warns(DataNote, match="taken for us"):
+        same(read(tmp_path / "a.csv", camera="pinhole"), rows())
+
+
+@pytest.mark.parametrize("head", ["# x y t p\n# from a sensor on a car\n", "240 180\n# x y t p\n"])
+def test_a_comment_that_names_the_columns_need_not_be_the_last_line_before_them(tmp_path, head):
+    (tmp_path / "a.txt").write_text(head + "5 10 20 1\n8 2 21 0\n")
+    same(read(tmp_path / "a.txt", camera="pinhole"), [[20, 5, 10, 1], [21, 8, 2, 0]])
+
+
+def test_columns_in_another_order_than_usual_are_told(tmp_path):
+    (tmp_path / "a.txt").write_text(written(rows(), "xypt", time=in_seconds))
+    with pytest.warns(DataNote, match="columns are taken to be x y p t; if they are not: name the columns"):
+        read(tmp_path / "a.txt", camera="pinhole")
+
+
+@pytest.mark.parametrize("lines", ["5 7 10 1\n3 9 11 0\n9 8 12 1\n", "9 7 0 1\n" + "".join(f"{t} 7 {t // 9} 1\n" for t in range(200))])
+def test_rows_that_rise_are_no_times_where_the_times_may_be_out_of_order(tmp_path, lines):
+    (tmp_path / "a.txt").write_text(lines)
+    refused(tmp_path / "a.txt", "t x y p or x y t p", "name the columns", camera="pinhole")
+
+
+def test_a_fraction_behind_whole_numbers_that_nobody_tells_the_unit_of(tmp_path):
+    (tmp_path / "a.txt").write_text(written(rows(3000), "txyp") + "9000000.5 1 2 0\n")
+    refused(tmp_path / "a.txt", "line 3001", "9000000.5 is no whole number", camera="pinhole")
+
+
+def test_an_exponent_beyond_all_measure_takes_no_time(tmp_path):
+    (tmp_path / "a.txt").write_text("# t_us x y p\n1e-99999999 1 2 0\n")
+    same(read(tmp_path / "a.txt", camera="pinhole"), [[0, 1, 2, 0]])
+
+
+def test_words_that_are_no_numbers_are_told_as_that(tmp_path):
+    (tmp_path / "a.csv").write_text('"1000","2","3","1"\n')
+    refused(tmp_path / "a.csv", "is not a number", "line 1", camera="pinhole")
+
+
 @pytest.mark.parametrize(
-    "line", ["1.5,,2,3,1", "1.5,2,,1", "1.5 2 3 1", "1.5,2,3", "1.5,-1,3,1", "1.5,2,-1,0", "x,2,3,1", "1.5,2,3,1,", "--1.5,2,3,1"]
+    "line",
+    ["1.5,,2,3,1", "1.5,2,,1", "1.5 2 3 1", "1.5,2,3", "1.5,-1,3,1", "1.5,2,-1,0", "x,2,3,1", "1.5,2,3,1,", "--1.5,2,3,1", "1.5,2,3,1 # c"],
 )
 def test_a_wrong_line_is_named_behind_a_header(tmp_path, line):
     head = "# a camera\nt,x,y,p\n"
@@ -149,8 +199,8 @@ def test_the_only_text_of_events_in_a_folder_is_found(tmp_path, other):
         {"groundtruth.txt": "0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "plane.txt": "0 0 -1 2\n"}.get(other, "0.1 1 1 1\n")
     )
     assert open(tmp_path, OpenOptions(sensor=(240, 180))).path == tmp_path / "events.csv"
-    (tmp_path / "more.csv").write_text(written(rows(), "txyp", separator=",", head="t_us,x,y,p\n"))
-    with pytest.raises(DataError, match=r"several recordings: events\.csv, more\.csv"):
+    (tmp_path / "more.CSV").write_text(written(rows(), "txyp", separator=",", head="t_us,x,y,p\n"))
+    with pytest.raises(DataError, match=r"several recordings: events\.csv, more\.CSV"):
         open(tmp_path)
 
 
@@ -168,7 +218,7 @@ NUMBERS = st.integers(0, 9_999_999_999)
     st.lists(st.tuples(NUMBERS, st.integers(0, 65535), st.integers(0, 65535), st.booleans()), min_size=2, max_size=20),
     st.permutations("txyp-"),
     st.sampled_from([" ", "\t", ",", ";", ", "]),
-    st.sampled_from(["s", "ms", "us", "ns", "fraction"]),
+    st.sampled_from(["s", "ms", "us", "ns", "fraction", "us_fraction"]),
     st.sampled_from(["0", "-1"]),
     st.sampled_from(["\n", "\r\n"]),
 )
@@ -177,13 +227,73 @@ def test_any_form_is_read_as_line_by_line(tmp_path_factory, numbers, order, sepa
     from torchcmax.io.events import Events
     from torchcmax.io.text import check_text, read_text
 
-    names = {"t": "t_s" if unit == "fraction" else f"t_{unit}", "x": "x", "y": "y", "p": "p", "-": "other"}
-    text = written(numbers, order, separator=separator, time=in_seconds if unit == "fraction" else str, dark=dark, end=end)
+    names = {"t": {"fraction": "t_s", "us_fraction": "t_us"}.get(unit, f"t_{unit}"), "x": "x", "y": "y", "p": "p", "-": "other"}
+    text = written(numbers, order, separator=separator, time=in_seconds if "fraction" in unit else str, dark=dark, end=end)
     file = tmp_path_factory.mktemp("any") / "a.csv"
     file.write_text(separator.join(names[name] for name in order) + end + text, newline="")
-    factor = 1 if unit == "fraction" else UNITS[unit]
+    factor = {"fraction": 1, "us_fraction": Fraction(1, 10**6)}.get(unit) or UNITS[unit]
     expected = [[math.floor(Fraction(t) * factor + Fraction(1, 2)), x, y, int(p)] for t, x, y, p in numbers]
     same(Events.join(list(read_text(file, 100, form=check_text(file)))), expected)
+
+
+@pytest.mark.parametrize(
+    ("separator", "end"), [("\t", "\n"), (" \t", "\r\n"), (" , ", " \n"), (";", "\t\r\n"), ("   ", "\n"), (",", "\n"), (", ", "\r\n")]
+)
+@pytest.mark.parametrize(
+    ("time", "pixel"), [(str, str), *((time, pixel) for time in (in_seconds, "{:.1f}".format) for pixel in (str, "{:.18e}".format))]
+)
+def test_no_form_that_is_the_same_in_every_line_is_read_line_by_line(tmp_path, monkeypatch, separator, end, time, pixel):
+    from torchcmax.io import text as module
+
+    monkeypatch.setattr(module, "_by_line", lambda *_: pytest.fail("line by line"))
+    head = separator.join(["x", "t_s" if time is in_seconds else "t_us", "p", "y"]) + end
+    lines = [separator.join([pixel(x), time(t), str(p), pixel(y)]) + end for t, x, y, p in rows()]
+    (tmp_path / "a.csv").write_text(head + "".join(lines), newline="")
+    same(read(tmp_path / "a.csv", camera="pinhole"), rows())
+
+
+@pytest.mark.parametrize(("unit", "times"), [("s", [1_250_000, 1_500_001]), ("ms", [1250, 1500]), ("us", [1, 2]), ("ns", [0, 0])])
+def test_decimal_numbers_have_the_unit_that_is_told(tmp_path, unit, times):
+    (tmp_path / "a.csv").write_text(f"t_{unit},x,y,p\n1.25,5.0,2.0,1.0\n1.5000006,5e0,7,-1\n")
+    same(read(tmp_path / "a.csv", camera="pinhole"), [[times[0], 5, 2, 1], [times[1], 5, 7, 0]])
+
+
+def test_what_stands_between_columns_is_the_same_in_every_line_or_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("# t_us x y p\n1, 5, 2, 1\n2,5 5, 2, 1\n")
+    refused(tmp_path / "a.csv", "line 3", "'5 5' is not a number", camera="pinhole")
+
+
+ODD = ["1.0", "7.", ".5", "+3", "-2", "-1", "2e1", "1e999", "nan", "1_0", "0x1", "", "1 2", "1\r2", "1,2", "é", "65536", '"1"', "# 1"]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10**8), st.integers(0, 999), st.integers(0, 999), st.sampled_from([-1, 0, 1])), min_size=1, max_size=4
+    ),
+    st.sampled_from([str, in_seconds, "{:.1f}".format, "{:.18e}".format]),
+    st.sampled_from([" ", "\t", "  ", ",", ", ", " ;\t"]),
+    st.sampled_from(["\n", "\r\n", " \n"]),
+    st.lists(st.tuples(st.integers(0, 15), st.sampled_from(ODD)), max_size=2),
+)
+def test_every_way_of_reading_finds_the_same_events_or_the_same_fault(events, time, separator, end, odd):
+    from torchcmax.io.text import _by_line, _parse
+
+    lines = [[time(t), str(x), str(y), str(p)] for t, x, y, p in events]
+    for place, word in odd:
+        lines[place // 4 % len(lines)][place % 4] = word
+    text = "".join(separator.join(words) + end for words in lines).encode()
+    unit = Fraction(10**6 if time is in_seconds else 1)
+    form = Form(separator=separator.strip() or " ", decimal=time is not str, unit=unit)
+
+    def outcome(reading):
+        try:
+            found = reading()
+        except DataError as error:
+            return str(error)
+        return np.stack([found.t, found.x, found.y, found.p], 1).astype(np.int64).tolist()
+
+    assert outcome(lambda: _parse(text, 1, "a.csv", form)[0]) == outcome(lambda: _by_line(text, 1, "a.csv", form))
 
 
 @pytest.mark.parametrize(

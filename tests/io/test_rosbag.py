@@ -174,6 +174,14 @@ def test_the_only_frames_of_tf_that_move_are_the_truth(tmp_path):
     torch.testing.assert_close(truth.pose.R, poses.pose.R)
 
 
+def test_frames_of_tf_in_any_order_of_time_are_sorted(tmp_path):
+    poses = placed(a_trajectory())
+    frames = [("world", "base", poses, "/tf"), ("world", "base", poses, "/relayed")]
+    truth = open(write(tmp_path / "a.bag", events(), frames=frames), OpenOptions()).truth
+    assert torch.equal(truth.time, poses.time)
+    torch.testing.assert_close(truth.pose.t, poses.pose.t)
+
+
 def test_of_several_frames_of_tf_that_move_none_is_taken(tmp_path):
     poses = placed(a_trajectory())
     frames = [("world", "camera", poses, "/tf"), ("world", "hand", poses, "/tf")]

@@ -39,6 +39,10 @@ def test_names_of_columns_need_no_mark(tmp_path):
         ("1403636579763555584,1,2,3,1,0,0,0", "time does not increase"),
         ("1403636579768555392,1,nan,3,1,0,0,0", "out of all range"),
         ("99999999999999999999999,1,2,3,1,0,0,0", "out of all range"),
+        ("1403636579768555392,1e200,2,3,1,0,0,0", "out of all range"),
+        ("1e999999999,1,2,3,1,0,0,0", "out of all range"),  # not written out
+        ("nan,1,2,3,1,0,0,0", "out of all range"),
+        ("1403636579.7685554,1,2,3,1,0,0,0", "no whole number of nanoseconds"),
     ],
 )
 def test_a_wrong_line_of_euroc_is_named(tmp_path, line, told):

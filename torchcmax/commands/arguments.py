@@ -19,7 +19,7 @@ from torchcmax.config import Parser, UsageError, usage
 from torchcmax.io import OpenOptions, Recording, open
 
 T = TypeVar("T")
-RECORDING_HELP = "folder with events.txt or events.h5 and calib.txt, the same as a .zip, or an HDF5 file"
+RECORDING_HELP = "file of a format that we know (AEDAT4, RAW, DAT, ES, bag, HDF5, npz, npy, text, csv, zip), or folder with one"
 
 
 def add_opening(command: Parser) -> None:

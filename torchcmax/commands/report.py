@@ -32,20 +32,27 @@ def run(config: Namespace) -> int:
     folders = [Path(name) for name in config.folders if name]
     if len(folders) < len(config.folders):
         raise UsageError("a folder's name is empty")
-    failed = 0
+    failed: list[DataError] = []
     for folder in folders:
-        alone = len(folders) == 1 and not inside(folder, BATCH)
+        try:
+            failed += _made(folder)
+        except DataError as error:  # the others must be seen
+            if len(folders) == 1:
+                raise
+            failed.append(error)
+    for one in failed:
+        print(f"torchcmax report: {one}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _made(folder: Path) -> list[DataError]:
+    """Make the page of a result, or the pages of a batch; those of its results that cannot be made."""
+    failed = []
+    if inside(folder, BATCH):
         for place in finished(folder):
             try:
-                page = write_page(place)
-            except DataError as error:  # the others must be seen
-                if alone:
-                    raise
-                print(f"torchcmax report: {error}", file=sys.stderr)
-                failed += 1
-            else:
-                if place == folder:
-                    print(f"report: {page}")
-        if inside(folder, BATCH):
-            print(f"report: {write_batch_page(folder, batch_rows(folder))}")
-    return 1 if failed else 0
+                write_page(place)
+            except DataError as error:
+                failed.append(error)
+    print(f"report: {write_batch_page(folder, batch_rows(folder)) if inside(folder, BATCH) else write_page(folder)}")
+    return failed

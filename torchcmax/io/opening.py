@@ -54,7 +54,7 @@ class OpenOptions:
     strict: bool = False
     """Refuse what would be mended: events out of order, or at equal times."""
     camera: str = ""
-    """Calibration file instead of the recording's own: ECD form, YAML, or the word pinhole."""
+    """Calibration file instead of the recording's own: ours, ECD's, Kalibr's, ROS's, DSEC's or OpenCV's; or the word pinhole."""
     sensor: tuple[int, int] | None = None
     """Width, height px, instead of what the recording says."""
     chunk: int = 1 << 20
@@ -81,7 +81,7 @@ def open(path: Path | str, options: OpenOptions | None = None) -> Recording:
         return _binary(form, path, options)
     if head.startswith(b"PK") or zipfile.is_zipfile(path):
         return _text(open_zip(path), path, path.stem, options)
-    if path.suffix in TEXTS or like_text(head) or head.startswith((GZIP, *UTF16)):
+    if path.suffix.lower() in TEXTS or like_text(head) or head.startswith((GZIP, *UTF16)):
         return _text(path.parent, path, path.parent.resolve().name, options, path.name)
     kind = "should be an HDF5 file and is none" if path.suffix in (".h5", ".hdf5") else "is not a recording"
     raise DataError(path, f"{kind}: it begins with {head[:16]!r}", WANTED)
@@ -111,7 +111,7 @@ def _folder(folder: Path, options: OpenOptions) -> Recording:
         return _binary(*known[0], options, folder)
     if known:
         raise _several(folder, [entry for _, entry in known])
-    texts = [entry for entry in entries if entry.suffix in TEXTS and entry.name not in OTHERS and entry.is_file()]
+    texts = [entry for entry in entries if entry.suffix.lower() in TEXTS and entry.name not in OTHERS and entry.is_file()]
     texts = [entry for entry in texts if like_text(_head(entry))]
     if len(texts) == 1:
         return _text(folder, texts[0], folder.resolve().name, options, texts[0].name)

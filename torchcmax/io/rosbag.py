@@ -212,18 +212,17 @@ def _trajectory(path: Path, name: str, rows: list[Row]) -> Trajectory:
 
 def _frames(path: Path, bag: Any) -> Trajectory | None:
     """The one pair of frames in tf that moves against each other, child to parent; None where none does, or nobody knows which it is."""
-    pairs: dict[tuple[str, str], list[Row]] = {}
+    pairs: dict[tuple[str, str], dict[int, Row]] = {}
     topics = [topic for topic in _topics(bag, FRAMES) if not topic.endswith("static")]
     for topic in topics:
         store = _typestore()
         for data in _messages(bag, topic):
             for told in store.deserialize_ros1(data, FRAMES[0]).transforms:
                 stamp, p, q = told.header.stamp, told.transform.translation, told.transform.rotation
-                rows = pairs.setdefault((told.header.frame_id, told.child_frame_id), [])
-                row: Row = (stamp.sec * 1_000_000 + round(stamp.nanosec / 1000), p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                if not rows or row[0] != rows[-1][0]:  # tf repeats what it has
-                    rows.append(row)
-    moving = {pair: rows for pair, rows in pairs.items() if len({row[1:] for row in rows}) > 1}
+                time = stamp.sec * 1_000_000 + round(stamp.nanosec / 1000)
+                rows = pairs.setdefault((told.header.frame_id, told.child_frame_id), {})
+                rows.setdefault(time, (time, p.x, p.y, p.z, q.x, q.y, q.z, q.w))  # tf repeats what it has, in any order
+    moving = {pair: sorted(rows.values()) for pair, rows in pairs.items() if len({row[1:] for row in rows.values()}) > 1}
     names = [f"{child} in {parent}" for parent, child in moving]
     if len(moving) != 1:
         if moving:

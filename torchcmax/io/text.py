@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import codecs
+import re
 import shlex
+import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from fractions import Fraction
-from itertools import islice
+from io import StringIO
+from itertools import accumulate, islice
 from math import floor
 from typing import IO
 
 import numpy as np
 
-from torchcmax.io.columns import ADVICE, NUMBER, SECONDS, Form, form_of
+from torchcmax.io.columns import ADVICE, MICRO, NUMBER, SECONDS, WHOLE, Form, Names, form_of, names_of, size_of
 from torchcmax.io.errors import DataError, DataNote, tell
 from torchcmax.io.events import LATEST, Events
 from torchcmax.io.member import Member, reading, refuse_foreign, size_in_bytes
@@ -23,7 +26,6 @@ BLOCK = 1 << 20  # bytes taken apart at a time: fits the processor's cache
 LONGEST = 1 << 16  # bytes of a line; more is no text of events
 FORM = "t x y p, separated by blanks: seconds, column, row, 0 or 1, like 0.003811 96 133 0"
 LOOKED_AT = 2000  # lines that tell a file's form
-HEAD = 1 << 12  # bytes that tell how a block is written
 DASH = (ord("-") - 48) % 256
 MOST = {"t": 12, "x": 5, "y": 5, "p": 1}  # digits of whole seconds, column, row, polarity
 
@@ -40,38 +42,44 @@ def check_text(file: Member) -> Form:
         refuse_foreign(file, stream.read(LONGEST))
     form = _form(file)
     _check_last(file, size, form)
-    if not form.told:
-        tell(DataNote(f"{file}: times are whole numbers, taken for us; if they are not: {ADVICE}"))
+    if form.taken:
+        tell(DataNote(f"{file}: {form.taken}; if they are not: {ADVICE}"))
     return form
 
 
 def like_text(head: bytes) -> bool:
     """Whether a file that begins like this, and has no ending that says so, may be a text of events."""
-    rows = [row.decode("ascii", "replace") for row in head.removeprefix(codecs.BOM_UTF8).split(b"\n")[:-1] or [head]]
-    comments = [row for row in rows if row.startswith("#")]
-    lines = [(number, row) for number, row in enumerate(rows, 1) if row.strip() and not row.startswith("#")]
+    lines = enumerate(head.removeprefix(codecs.BOM_UTF8).split(b"\n")[:-1] or [head], 1)
     try:
-        form = form_of(lines, comments[-1].lstrip("# ") if comments else "")
-        _row(lines[form.skip][1], form)
+        rows, names = _first(lines)
+        form = form_of(rows, names)
+        _row(rows[form.skip][1], form)
     except (ValueError, IndexError):
         return False
     return True
 
 
-def _form(file: Member) -> Form:
-    """The form of its first lines; where the first is no event the whole file is of another form, so dropping the line would not help."""
-    comment, rows = "", list[tuple[int, str]]()
-    for number, raw in _lines(file):
+def _first(lines: Iterable[tuple[int, bytes]]) -> tuple[list[tuple[int, str]], Names]:
+    """The first lines that are neither empty nor comments, with their numbers; and the names of columns in a comment before them."""
+    rows: list[tuple[int, str]] = []
+    names: Names = ()
+    for number, raw in lines:
         row = raw.decode("utf-8", "backslashreplace").strip()
-        if row.startswith("#"):
-            comment = comment if rows else row.lstrip("# ")
-        elif row:
-            rows.append((number, row))
+        if not row.startswith("#"):
+            rows += [(number, row)] if row else []
+        elif not rows or (len(rows) == 1 and size_of(rows[0][1])):
+            names = names_of(row.lstrip("# ")) or names
         if len(rows) >= LOOKED_AT:
             break
+    return rows, names
+
+
+def _form(file: Member) -> Form:
+    """The form of its first lines; where the first is no event the whole file is of another form, so dropping the line would not help."""
+    rows, names = _first(_lines(file))
     number, first = 1, ""
     try:
-        form = form_of(rows, comment)
+        form = form_of(rows, names)
         if len(rows) > form.skip:
             number, first = rows[form.skip]
             _row(first, form)
@@ -161,16 +169,14 @@ def _blocks(stream: IO[bytes], size: int, file: Member) -> Iterator[bytes]:
 
 
 def _parse(text: bytes, line: int, file: Member, form: Form) -> tuple[Events, int]:
-    """A block of lines as events, and the number of lines: the quick way where every line is plain, else line by line."""
-    events = _plain(text, form) if _is_tidy(text[:HEAD], form) else None  # to tidy takes nearly as long as to read
+    """A block of lines as events, and the number of lines: the quickest way that every line allows, line by line in the end."""
+    events = _plain(text, form)
+    if events is not None:
+        return events, len(events)
+    events = _plain(_tidy(text, form), form)
     if events is None:
-        events = _plain(_tidy(text, form), form)
+        events = _decimals(text, form)
     return _by_line(text, line, file, form) if events is None else events, text.count(b"\n")
-
-
-def _is_tidy(head: bytes, form: Form) -> bool:
-    """Whether lines that begin like this have one separator between columns, and nothing else."""
-    return not any(mark in head for mark in ((b"\r", b"\t", b"  ") if form.separator == " " else (b"\r", b"\t", b" ")))
 
 
 def _tidy(text: bytes, form: Form) -> bytes:
@@ -185,10 +191,11 @@ def _tidy(text: bytes, form: Form) -> bytes:
 
 def _plain(text: bytes, form: Form) -> Events | None:
     """Lines of digits like `1.234567 12 34 1`, all at once, twice as fast as np.loadtxt; None where one line is of another form."""
-    if not text or (form.decimal and form.unit != SECONDS):
+    gaps = _gaps(text[: text.find(b"\n") + 1], form)
+    if not gaps or (form.decimal and form.unit not in (SECONDS, MICRO)):
         return None
     digit = np.frombuffer(text, np.uint8) - np.uint8(48)
-    found = _between(digit, form, b"-" in text)
+    found = _between(digit, gaps, form, b"-" in text)
     if found is None:
         return None
     dot, starts, ends = found
@@ -198,7 +205,8 @@ def _plain(text: bytes, form: Form) -> Events | None:
     if form.decimal:
         last["t"] = dot
     width = {name: last[name] - first[name] for name in "txyp"}
-    most = MOST | ({} if form.decimal else {"t": 19})
+    seconds = form.decimal and form.unit == SECONDS
+    most = MOST | ({} if seconds else {"t": 19})
     if any(w.min() < 1 or w.max() > most[name] for name, w in width.items()) or (form.decimal and (after - dot).min() < 2):
         return None
     x, y, p = (_whole(digit, width[name], last[name], np.int32) for name in "xyp")
@@ -207,10 +215,12 @@ def _plain(text: bytes, form: Form) -> Events | None:
     if b"-" in text:
         p[digit.take(first["p"] - 1, mode="wrap") == DASH] = 0
     t = _whole(digit, width["t"], last["t"], np.int64)
-    if form.decimal:
+    if seconds:
         t = t * 1_000_000 + _millionths(digit, dot, after)
     elif t.min() < 0 or t.max() > (LATEST - 1) / form.unit:
         return None
+    elif form.decimal:
+        t += digit.take(dot + 1) >= 5
     elif form.unit < 1:
         t = (t + form.unit.denominator // 2) // form.unit.denominator
     else:
@@ -218,12 +228,22 @@ def _plain(text: bytes, form: Form) -> Events | None:
     return Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
 
 
-def _between(digit: np.ndarray, form: Form, signed: bool) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]] | None:
+def _gaps(line: bytes, form: Form) -> list[bytes]:
+    """What stands behind each column of a line; nothing where that is more than a separator, blanks and the line's end."""
+    gaps = re.findall(rb"[^0-9.-]+", line)
+    marks = [form.separator.strip().encode()] * (form.columns - 1) + [b"\n"]
+    return gaps if [gap.strip(b" \t\r") for gap in gaps] == marks else []
+
+
+def _between(
+    digit: np.ndarray, gaps: list[bytes], form: Form, signed: bool
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]] | None:
     """Where the dots of the times are, and where each column begins and ends.
 
-    None where anything but separators, dots, line feeds and the minus of a polarity is between digits.  signed: there is a minus
+    None where anything but the gaps, dots and the minus of a polarity is between digits.  signed: there is a minus
     """
-    marks = form.separator.join("." if form.decimal and column == form.order[0] else "" for column in range(form.columns)) + "\n"
+    parts = [b"." + gap if form.decimal and column == form.order[0] else gap for column, gap in enumerate(gaps)]
+    marks, behind = b"".join(parts), list(accumulate(map(len, parts)))
     other = np.flatnonzero(digit > 9)
     minus = other[digit.take(other) == DASH] if signed else other[:0]
     if len(minus):
@@ -231,18 +251,19 @@ def _between(digit: np.ndarray, form: Form, signed: bool) -> tuple[np.ndarray, l
     if len(other) % len(marks):
         return None
     place = list(other.reshape(-1, len(marks)).T.copy())
-    if any((digit.take(row) != (ord(mark) - 48) % 256).any() for row, mark in zip(place, marks, strict=True)):
+    if any((digit.take(row) != (mark - 48) % 256).any() for row, mark in zip(place, marks, strict=True)):
         return None
-    dot = place[marks.index(".")] if form.decimal else place[0]
-    ends = [row for row, mark in zip(place, marks, strict=True) if mark != "."]
-    starts = [np.concatenate([[0], place[-1][:-1] + 1]), *(end + 1 for end in ends[:-1])]
+    ends, last = [place[i - len(gap)] for i, gap in zip(behind, gaps, strict=True)], [place[i - 1] for i in behind]
+    if any((stop - end != len(gap) - 1).any() for end, stop, gap in zip(ends, last, gaps, strict=True) if len(gap) > 1):
+        return None
+    starts = [np.concatenate([[0], last[-1][:-1] + 1]), *(stop + 1 for stop in last[:-1])]
     polarity = form.order[3]
     if signed:
         dark = digit.take(starts[polarity]) == DASH
         if dark.sum() != len(minus):
             return None
         starts[polarity] = starts[polarity] + dark
-    return dot, starts, ends
+    return place[marks.find(b".")], starts, ends
 
 
 def _whole(digit: np.ndarray, width: np.ndarray, end: np.ndarray, dtype: type[np.signedinteger]) -> np.ndarray:
@@ -271,6 +292,27 @@ def _millionths(digit: np.ndarray, dot: np.ndarray, end: np.ndarray) -> np.ndarr
     return value + ((digit.take(dot + 7, mode="clip") >= 5) & (width >= 7)) if most >= 7 else value
 
 
+def _decimals(text: bytes, form: Form) -> Events | None:
+    """Numbers in any spelling, like 1.5e-3 or 12.0, through float64; None where times are whole or in ms or ns, or one line is no event."""
+    if not form.decimal or form.unit not in (SECONDS, MICRO) or not text.strip():
+        return None
+    try:
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of blocks of nothing but empty lines
+            rows = np.loadtxt(StringIO(text.decode("ascii")), comments=None, delimiter=form.separator.strip() or None, ndmin=2)
+    except ValueError:
+        return None
+    if rows.shape[1] != form.columns:
+        return None
+    t, x, y, p = rows.T[list(form.order)]
+    with np.errstate(over="ignore"):
+        t = np.rint(t * 1e6) if form.unit == SECONDS else np.floor(t + 0.5)
+    pixel = np.stack([x, y])
+    pixels = (pixel >= 0) & (pixel <= 65535) & (pixel == np.rint(pixel))
+    if not ((abs(t) < LATEST).all() and pixels.all() and np.isin(p, (-1, 0, 1)).all()):
+        return None
+    return Events(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), (p > 0).astype(np.uint8))
+
+
 def _by_line(text: bytes, line: int, file: Member, form: Form) -> Events:
     """Events line by line, from line number `line` on, with comments, exponents, minus signs; the first line that is wrong is named."""
     rows = []
@@ -297,6 +339,8 @@ def _row(row: str, form: Form) -> tuple[int, int, int, int]:
             raise ValueError(f"{column} is no measurement")
         if not NUMBER.fullmatch(column):
             raise ValueError(f"{_quoted(column)} is not a number")
+    if not form.decimal and form.taken and not WHOLE.fullmatch(columns[0]):
+        raise ValueError(f"the time {columns[0]} is no whole number, as those before are")
     t, x, y, p = map(float, columns)
     if not abs(t * float(form.unit)) < LATEST:
         raise ValueError(f"{columns[0]} is no time in {'seconds' if form.unit == SECONDS else 'its unit'}")
@@ -304,13 +348,13 @@ def _row(row: str, form: Form) -> tuple[int, int, int, int]:
         raise ValueError(f"({columns[1]}, {columns[2]}) is no pixel")
     if p not in (-1, 0, 1):
         raise ValueError(f"polarity {columns[3]} is neither 0 nor 1")
-    micro = round(t * 1e6) if form.unit == SECONDS else floor(Fraction(columns[0]) * form.unit + Fraction(1, 2))
+    micro = round(t * 1e6) if form.unit == SECONDS else floor(Fraction(columns[0]) * form.unit + Fraction(1, 2)) if t else 0
     return micro, int(x), int(y), int(p > 0)
 
 
 def _told(form: Form) -> str:
     """What a line should look like."""
-    if form == replace(Form(), line=form.line, skip=form.skip, sensor=form.sensor):
+    if form == replace(Form(), taken=form.taken, line=form.line, skip=form.skip, sensor=form.sensor):
         return FORM
     names = [next((name for name, column in zip("txyp", form.order, strict=True) if column == i), "-") for i in range(form.columns)]
     return f"{form.separator.join(names)}, as the first lines are"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from fractions import Fraction
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from torchcmax.io.member import LARGE, SMALL, Member, text_lines, text_of
 TUM = "t tx ty tz qx qy qz qw"
 EUROC = "t[ns],px,py,pz,qw,qx,qy,qz, and more that is not read"
 VELOCITY = "t[s]  v_x v_y v_z [m/s]  w_x w_y w_z [rad/s]   (body frame = camera frame)"
+FARTHEST = 1e100  # what is larger overflows when squared
 PLANE = "nx ny nz d   with n.X + d = 0 in the world frame, n unit and towards the camera, d > 0"
 
 
@@ -42,15 +43,19 @@ def read_euroc(file: Member) -> Trajectory:
     for number, line in lines:
         words = line.split(",")
         try:
-            time.append(round(Fraction(words[0].strip()) / 1000))
+            nano = Decimal(words[0].strip())
             rows.append([float(word) for word in words[1:8]])
-        except (ValueError, ZeroDivisionError) as error:
+        except (ValueError, ArithmeticError) as error:
             raise DataError(str(file), f"not all are numbers: {line[:80]!r}", f"a line is {EUROC}", f"line {number}") from error
+        known = nano.is_finite() and -1000 * LATEST < nano < 1000 * LATEST
+        if known and nano != nano.to_integral_value():
+            remedy = f"a line is {EUROC}; a table in seconds with qw last wants blanks between its columns: tr ',' ' '"
+            raise DataError(str(file), f"its time is no whole number of nanoseconds: {line[:80]!r}", remedy, f"line {number}")
+        time.append(round(nano / 1000) if known else LATEST)  # which is refused below
         if len(rows[-1]) < 7:
             raise DataError(str(file), f"{len(words)} columns: {line[:80]!r}", f"a line is {EUROC}", f"line {number}")
     table = np.array(rows).reshape(-1, 7)
-    micro = np.array([t if abs(t) < LATEST else LATEST for t in time], np.int64)  # what is out of range is refused below
-    return checked_trajectory(str(file), micro, table[:, :3], table[:, [4, 5, 6, 3]], lambda i: f"line {lines[i][0]}")
+    return checked_trajectory(str(file), np.array(time, np.int64), table[:, :3], table[:, [4, 5, 6, 3]], lambda i: f"line {lines[i][0]}")
 
 
 def checked_trajectory(file: str, time: np.ndarray, p: np.ndarray, q: np.ndarray, place: Callable[[int], str]) -> Trajectory:
@@ -65,7 +70,7 @@ def checked_trajectory(file: str, time: np.ndarray, p: np.ndarray, q: np.ndarray
         raise DataError(file, f"has poses of shapes t {time.shape}, p {p.shape}, q {q.shape}", f"{wants}: shapes (M,), (M, 3), (M, 4)")
     if len(time) < 2:
         raise DataError(file, f"holds {len(time)} poses", f"a trajectory wants at least 2; {wants}")
-    known = (time > -LATEST) & (time < LATEST) & np.isfinite(p).all(1) & np.isfinite(q).all(1)
+    known = (time > -LATEST) & (time < LATEST) & (abs(p) < FARTHEST).all(1) & np.isfinite(q).all(1)
     refuse(~known, "a number out of all range", wants)
     refuse(abs(np.linalg.norm(q, axis=1) - 1) > 0.01, "qx qy qz qw is no unit quaternion", wants)
     micro = (time if time.dtype.kind in "iu" else np.rint(time)).astype(np.int64)
