@@ -1,6 +1,7 @@
 """Results against ground truth: protocols, velocities, offsets, and the command."""
 
 import csv
+import dataclasses
 import json
 import math
 import shutil
@@ -15,11 +16,11 @@ from torchcmax.cli import main
 from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose, Trajectory
-from torchcmax.evaluate import EvaluateOptions, Run, evaluate
-from torchcmax.io import DataError, DataWarning
+from torchcmax.evaluate import ALL, EvaluateOptions, Run, evaluate
+from torchcmax.io import DataError, DataNote, DataWarning
 from torchcmax.io.trajectory import read_trajectory, write_trajectory
 from torchcmax.protocols import PROTOCOLS
-from torchcmax.velocity import Velocities, velocity_errors
+from torchcmax.velocity import Velocities, true_velocities, velocity_errors
 
 MILLI = 1000
 WALL = Plane(torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64))
@@ -148,6 +149,45 @@ def test_a_straight_line_is_refused_by_umeyama_and_not_by_us():
         judged(run_of(slide), slide, "sim3")
 
 
+def test_all_leaves_out_what_cannot_judge_and_says_why():
+    pytest.importorskip("evo", reason="the extra eval is not installed")
+    truth = path()
+    with pytest.warns(DataNote) as told:
+        rows = evaluate(run_of(moved(truth, PLACE)), truth, None, Path("truth.txt"), ALL).rows  # in plane distances, without a plane
+    assert [row["protocol"] for row in rows] == ["similarity", "rotation", "sim3", "cmax_slam"]
+    assert [str(note.message).split()[1] for note in told] == ["se3", "first_pose"]
+    beyond = Trajectory(truth.time[-1] + truth.time, truth.pose)  # one pose of it in the truth's time
+    with pytest.warns(DataNote), pytest.raises(DataError, match="at least two"):
+        evaluate(run_of(beyond), truth, None, Path("truth.txt"), ALL)
+
+
+def test_a_run_that_holds_nothing_is_refused():
+    with pytest.raises(DataError, match="neither a trajectory nor velocities"):
+        evaluate(run_of(None), path(), None, Path("truth.txt"))
+
+
+@pytest.mark.parametrize("name", ["sim3", "se3"])
+def test_an_almost_straight_path_is_told_where_it_turns_the_world(name):
+    pytest.importorskip("evo", reason="the extra eval is not installed")
+    time, noise = torch.arange(101) * 10 * MILLI, torch.Generator().manual_seed(3)
+    t = 1e-6 * torch.randn(101, 3, dtype=torch.float64, generator=noise)
+    t[:, 0] = torch.linspace(0, 1, 101, dtype=torch.float64)
+    R = torch.eye(3, dtype=torch.float64).repeat(101, 1, 1)
+    truth = Trajectory(time, Pose(R, t))
+    estimate = Trajectory(time, Pose(R, t * torch.tensor([1.0, -1, -1], dtype=torch.float64)))  # rolled by half a turn about the path
+    with pytest.warns(DataWarning, match=f"{name} turns the world by 180.0 degrees"):
+        row = judged(run_of(estimate, metric=True), truth, name, delta=0.1)
+    assert row["rotation_rmse_deg"] == pytest.approx(180, abs=0.1)
+    assert row["ate_max_m"] < 1e-9
+
+
+def test_no_two_poses_so_far_apart_are_told():
+    pytest.importorskip("evo", reason="the extra eval is not installed")
+    with pytest.warns(DataNote, match="no pose has one 5 s later"):
+        row = judged(run_of(path(), turning=True), path(), "cmax_slam", delta=5.0)
+    assert row["rpe_pairs"] == 0
+
+
 @pytest.mark.parametrize("offset", [0.0371, -0.012])
 def test_an_offset_of_the_clocks_is_found(offset):
     truth = path()
@@ -169,6 +209,35 @@ def test_an_even_slide_tells_no_offset():
     R = torch.eye(3, dtype=torch.float64).repeat(len(time), 1, 1)
     with pytest.raises(DataError, match="offset"):
         judged(run_of(Trajectory(time, Pose(R, t + noise))), Trajectory(time, Pose(R, t)), "similarity", offset="estimate")
+
+
+def test_a_camera_that_stands_still_tells_no_offset():
+    truth = path()
+    still = (truth.time > 800_000) & (truth.time < 1_300_000)
+    i = int(still.nonzero()[0])
+    parts = (torch.where(still.view(-1, *[1] * (x.dim() - 1)), x[i], x) for x in (truth.pose.R, truth.pose.t))
+    rests = Trajectory(truth.time, Pose(*parts))
+    with pytest.raises(DataError, match="about as well"):  # only what is asked for counts
+        judged(run_of(moved(rests, PLACE)), rests, "similarity", offset="estimate", begin=0.9, end=1.1)
+
+
+@pytest.mark.parametrize(("size", "told"), [(0.0, "offset"), (1.0, "")])
+def test_an_offset_of_velocities_is_told_by_turns_only(size, told):
+    """A model without rotation fits best where the truth rests, here at 1.7 to 2.4 s; that is no offset."""
+    time = torch.arange(0, 4_000_001, MILLI)
+    s = time.double() * 1e-6
+    s = torch.where(s < 1.7, s, (s - 0.7).clamp_min(1.7))
+    turn = torch.stack([s.square().sin(), (2 * s).cos(), 0 * s], -1)
+    truth = Trajectory(time, Pose(so3.exp(turn), torch.zeros(len(time), 3, dtype=torch.float64)))
+    start = torch.arange(2_500_000, 3_000_000, 10 * MILLI)
+    known = Velocities(start, start + 10 * MILLI, start, torch.zeros(len(start), 3, dtype=torch.float64), None, False)
+    known = dataclasses.replace(known, omega=size * true_velocities(known, truth)[0]).later(-50 * MILLI)
+    run = run_of(None, velocities=known)
+    if told:
+        with pytest.raises(DataError, match=told):
+            judged(run, truth, "velocity", offset="estimate")
+    else:
+        assert judged(run, truth, "velocity", offset="estimate")["offset_s"] == pytest.approx(0.05, abs=3e-5)
 
 
 def test_truth_of_a_body_becomes_that_of_the_camera():
@@ -304,6 +373,7 @@ def test_velocities_of_a_result_are_those_of_the_simulated_camera(tracked, capsy
     assert row["v_percent"] < 25
 
 
+@pytest.mark.filterwarnings("ignore:.*turns the world")  # a third of a second is not far from a line
 def test_every_protocol_judges_a_result(tracked, capsys):
     pytest.importorskip("evo", reason="the extra eval is not installed")
     status, out, _ = said(capsys, tracked, "--protocol", "all", "--json", "--delta", 0.1)
@@ -327,6 +397,19 @@ def test_a_trajectory_of_another_system_is_judged_too(tracked, small, tmp_path, 
     status, _, err = said(capsys, tmp_path / "other.txt")
     assert status == 1
     assert "--truth" in err
+
+
+def test_numbers_are_shown_also_where_they_cannot_be_kept(tracked, tmp_path, capsys):
+    run = shutil.copytree(tracked, tmp_path / "run", ignore=shutil.ignore_patterns("evaluation.*"))
+    (run / "evaluation.csv").mkdir()  # nothing can be renamed to it
+    status, out, err = said(capsys, run)
+    assert status == 1
+    assert out.splitlines()[1].split()[1] == "similarity"
+    assert "evaluation.csv: cannot be written" in err
+    status, out, err = said(capsys, tracked, "--csv", tmp_path / "nowhere" / "table.csv")
+    assert status == 1
+    assert out.splitlines()[1].split()[1] == "similarity"
+    assert "table.csv: cannot be written" in err
 
 
 def test_one_of_several_that_cannot_be_judged_does_not_stop_the_others(tracked, tmp_path, capsys):

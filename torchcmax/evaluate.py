@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +18,22 @@ from torchcmax.core import so3
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.folder import EVALUATION, SUMMARY, versions, writing
-from torchcmax.io import DataError, DataWarning
+from torchcmax.io import DataError, DataNote, DataWarning
 from torchcmax.io.errors import tell
 from torchcmax.io.trajectory import TUM, read_trajectory
 from torchcmax.protocols import PROTOCOLS, Protocol
 from torchcmax.resultfiles import Result, inside, read_result
-from torchcmax.score import GAP, common, coverage, errors, path_length, rotation, similarity
+from torchcmax.score import GAP, Similarity, common, coverage, errors, path_length, rotation, similarity
 from torchcmax.score import inside as inside_truth
 from torchcmax.velocity import Velocities, true_velocities, velocity_errors, within
 
+ALL = ("all",)  # the protocols that can judge a run, by themselves
 ESTIMATE = "estimate"  # the word for an offset that is looked for
 REACH, COARSE, FINE = 1_000_000, 5_000, 20  # µs: offsets looked for, and how finely
 ENOUGH = 2000  # poses that an offset is looked for with
-CLEAR = 1.2  # so many times better than usual must the best offset be
+CLEAR, WIDE = 1.2, 100_000  # offsets that fit worse than the best by at most this factor, and how far apart, µs, they may be
+EVER = 1 << 62  # µs; beyond all times
+TURNED = 5.0  # °; so far from where orientations lay the world, positions that lay it otherwise are told of
 Row = dict[str, Any]
 
 
@@ -199,19 +203,22 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 def evaluate(
     run: Run, truth: Trajectory, plane: Plane | None, where: Path, names: Sequence[str] = (), options: EvaluateOptions | None = None
 ) -> Evaluation:
-    """A run against the truth, T_wb in metres, and its plane [1] in the same world, by protocols in `PROTOCOLS`, or the usual ones.
+    """A run against the truth, T_wb in metres, and its plane [1] in the same world.
 
+    names: of protocols in `PROTOCOLS`; none: the usual ones; `ALL`: those that can judge it, a note tells why one cannot
     DataError where a protocol cannot judge the run, or nothing of it lies within the truth's time
     """
     options = options or EvaluateOptions()
+    if not run.usual:
+        raise DataError(run.place, "holds neither a trajectory nor velocities of windows", "wait for the run's end, or run it again")
     truth = Trajectory(truth.time, truth.pose @ options.camera())
     _tell_gaps(truth, where)
     try:
-        span = _span(run, truth, options)
-        offset = _find_offset(run, truth, span) if options.offset == ESTIMATE else round(float(options.offset) * 1e6)
-        span = _span(run, truth, options, offset)
+        asked = _asked(run, options)
+        offset = _find_offset(run, truth, asked) if options.offset == ESTIMATE else round(float(options.offset) * 1e6)
+        span = common(truth, *(None if abs(time) >= EVER else time + offset for time in asked))
         case = _Case(run, truth, plane, span, offset, options)
-        rows = [case.row(name) for name in names or run.usual]
+        rows = case.all() if names == ALL else [case.row(name) for name in names or run.usual]
     except ValueError as error:
         raise DataError(
             run.place, f"cannot be judged: {error}", "check the clocks, --offset, --from and --to, or take another protocol"
@@ -221,12 +228,11 @@ def evaluate(
     return Evaluation(rows, where, offset * 1e-6, options.offset == ESTIMATE)
 
 
-def _span(run: Run, truth: Trajectory, options: EvaluateOptions, offset: int = 0) -> tuple[int, int]:
-    """The time that is judged, µs of the truth's clock: of the run's windows, --from and --to, and the truth."""
-    begin, end = run.span or (None, None)
-    begin = begin if options.begin is None else max(round(options.begin * 1e6), -(1 << 62) if begin is None else begin)
-    end = end if options.end is None else min(round(options.end * 1e6), 1 << 62 if end is None else end)
-    return common(truth, None if begin is None else begin + offset, None if end is None else end + offset)
+def _asked(run: Run, options: EvaluateOptions) -> tuple[int, int]:
+    """The time that is to be judged, µs of the run's clock: of its windows, and --from and --to."""
+    first, last = run.span or (-EVER, EVER)
+    begin, end = (None if second is None else round(max(-1e12, min(second, 1e12)) * 1e6) for second in (options.begin, options.end))
+    return first if begin is None else max(first, begin), last if end is None else min(last, end)
 
 
 def _tell_gaps(truth: Trajectory, where: Path) -> None:
@@ -249,12 +255,28 @@ class _Case:
     offset: int
     options: EvaluateOptions
 
+    def all(self) -> list[Row]:
+        """By every protocol that can judge the run; ValueError where none can."""
+        rows, wrong = [], "no protocol can judge it"
+        for name, protocol in PROTOCOLS.items():
+            if self.run.lacks(protocol):
+                continue
+            try:
+                rows.append(self.row(name))
+            except ValueError as error:
+                wrong = str(error)
+                tell(DataNote(f"{self.run.place}: {name} cannot judge it: {wrong}"))
+        if not rows:
+            raise ValueError(wrong)
+        return rows
+
     def row(self, name: str) -> Row:
         """By one protocol."""
         protocol = PROTOCOLS[name]
         if lack := self.run.lacks(protocol):
             raise DataError(self.run.place, f"the protocol {name} cannot judge it: {lack}", f"take --protocol {','.join(self.run.usual)}")
         head = {"result": self.run.name, "protocol": name, "from_s": self.span[0] * 1e-6, "to_s": self.span[1] * 1e-6}
+        head["offset_s"] = self.offset * 1e-6
         return head | (self._velocity() if protocol.align is None else self._poses(protocol, protocol.align))
 
     def _kept(self) -> Trajectory:
@@ -269,6 +291,8 @@ class _Case:
         scale = self._metres(kept.pose, there) if align in ("se3", "pose") and not protocol.turning else 1.0
         best = laid(align, kept.pose, there, scale, at)
         position, turn = (evo_absolute if protocol.evo else absolute)(kept, self.truth, best)
+        if align in ("sim3", "se3"):
+            self._tell_turned(align, best, rotation(kept.pose, there))
         row: Row = {"poses": len(kept), "coverage": coverage(kept.time, self.span)}
         if not protocol.turning:
             row |= {"scale": best.scale.item()} | _named("ate", position, "m")
@@ -279,9 +303,20 @@ class _Case:
         if protocol.evo:
             pairs, position, turn = evo_relative(kept, self.truth, best, round(self.options.delta * 1e6))
             row |= {"rpe_delta_s": self.options.delta, "rpe_pairs": pairs}
+            if not pairs:
+                tell(DataNote(f"{self.run.place}: no pose has one {self.options.delta:g} s later (--delta): no relative errors"))
             row |= {} if protocol.turning else _named("rpe_translation", position, "m")
             row |= _named("rpe_rotation", turn, "deg")
         return row
+
+    def _tell_turned(self, name: str, positions: Similarity, orientations: Similarity) -> None:
+        """Positions close to a line hardly hold the rotation about it: only the orientations show that it is wrong."""
+        apart = math.degrees(float(so3.log(orientations.R.mT @ positions.R).norm()))
+        if apart > TURNED:
+            text = (
+                f"{self.run.place}: {name} turns the world by {apart:.1f} degrees from where orientations lay it; the path is too close to "
+            )
+            tell(DataWarning(f"{text}a line, or the truth is not of the camera (--extrinsic): rotation errors are of that, not of the run"))
 
     def _index(self, time: Tensor) -> int:
         """Of the pose that is laid on the truth's."""
@@ -318,9 +353,9 @@ def _named(name: str, statistics: Statistics, unit: str) -> Row:
     return {f"{name}_{statistic}_{unit}": value for statistic, value in statistics.items()}
 
 
-def _find_offset(run: Run, truth: Trajectory, span: tuple[int, int]) -> int:
-    """What is to be added to the run's times, µs, so that it fits the truth best; ValueError where nothing tells."""
-    cost = _pose_cost(run, run.trajectory, truth, span) if run.trajectory is not None else _velocity_cost(run, truth, span)
+def _find_offset(run: Run, truth: Trajectory, asked: tuple[int, int]) -> int:
+    """What is to be added to the run's times, µs, so that what is asked of it fits the truth best; ValueError where nothing tells."""
+    cost = _pose_cost(run, run.trajectory, truth, asked) if run.trajectory is not None else _velocity_cost(run, truth, asked)
     shifts = torch.arange(-REACH, REACH + 1, COARSE)
     costs = torch.tensor([cost(int(shift)) for shift in shifts], dtype=torch.float64)
     known = costs.isfinite().nonzero()[:, 0]
@@ -329,19 +364,24 @@ def _find_offset(run: Run, truth: Trajectory, span: tuple[int, int]) -> int:
     best = int(known[costs[known].argmin()])
     if best in (int(known[0]), int(known[-1])):
         raise ValueError(f"no offset within {shifts[known[0]] * 1e-6:g}..{shifts[known[-1]] * 1e-6:g} s fits better than those around")
-    if costs[known].median() < CLEAR * costs[best]:
-        raise ValueError("it moves too evenly, or fits too badly, to tell an offset of time")
+    near = shifts[known[costs[known] <= CLEAR * costs[best] + 1e-9]]
+    if near[-1] - near[0] > WIDE:
+        text = "it moves too evenly, or fits too badly, to tell an offset of time: "
+        raise ValueError(f"{text}offsets of {near[0] * 1e-6:g}..{near[-1] * 1e-6:g} s fit about as well")
     return _lowest(cost, int(shifts[best]) - COARSE, int(shifts[best]) + COARSE)
 
 
-def _pose_cost(run: Run, trajectory: Trajectory, truth: Trajectory, span: tuple[int, int]) -> Callable[[int], float]:
-    """Error after the best alignment: orientations in rad, and positions as a share of how far they spread."""
-    step = -(-len(trajectory) // ENOUGH)
-    time, pose = trajectory.time[::step], trajectory.pose[::step]
+def _pose_cost(run: Run, trajectory: Trajectory, truth: Trajectory, asked: tuple[int, int]) -> Callable[[int], float]:
+    """Error after the best alignment: orientations in rad, and positions as a share of how far the truth's spread."""
+    keep = (trajectory.time >= asked[0]) & (trajectory.time <= asked[1])
+    keep &= (trajectory.time >= truth.time[0] - REACH) & (trajectory.time <= truth.time[-1] + REACH)
+    time, pose = trajectory.time[keep], trajectory.pose[keep]
+    step = max(1, -(-len(time) // ENOUGH))
+    time, pose = time[::step], pose[::step]
     align = rotation if run.turning else similarity
-    now = (time >= span[0]) & (time <= span[1])
-    least = max(3, int(now.sum()) // 2)
-    place = truth.at(time[now]).t
+    now = time[(time >= truth.time[0]) & (time <= truth.time[-1])]
+    least = max(3, len(now) // 2)
+    place = truth.at(now).t
     spread = (place - place.mean(0)).square().sum(-1).mean().sqrt()
 
     def cost(shift: int) -> float:
@@ -356,17 +396,18 @@ def _pose_cost(run: Run, trajectory: Trajectory, truth: Trajectory, span: tuple[
     return cost
 
 
-def _velocity_cost(run: Run, truth: Trajectory, span: tuple[int, int]) -> Callable[[int], float]:
-    """Error of the angular velocities."""
+def _velocity_cost(run: Run, truth: Trajectory, asked: tuple[int, int]) -> Callable[[int], float]:
+    """Error of the angular velocities, as a share of both, so that a moment at which nothing turns is not the best."""
     assert run.velocities is not None
-    velocities = within(run.velocities, truth, span)
-    least = max(3, len(velocities) // 2)
+    velocities = run.velocities[(run.velocities.start >= asked[0]) & (run.velocities.end <= asked[1])]
+    least = max(3, len(within(velocities, truth, common(truth))) // 2)
 
     def cost(shift: int) -> float:
         moved = within(velocities.later(shift), truth, common(truth))
         if len(moved) < least:
             return float("inf")
-        return float((moved.omega - true_velocities(moved, truth)[0]).square().sum(-1).mean().sqrt())
+        found, there = moved.omega, true_velocities(moved, truth)[0]
+        return float((found - there).norm() / torch.hypot(found.norm(), there.norm()))  # nan where neither turns
 
     return cost
 

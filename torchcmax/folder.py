@@ -39,7 +39,8 @@ def writing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise DataError(path, f"cannot be written: {error.strerror}", "free some space, or give another --out") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # of a file system that cannot be written to
+            temporary.unlink(missing_ok=True)
 
 
 def cell(value: float, whole: bool) -> str:

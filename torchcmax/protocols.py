@@ -41,22 +41,22 @@ PROTOCOLS = {
     ),
     "sim3": Protocol(
         "ATE after Sim(3) of the positions, and RPE: a camera that cannot know its scale",
-        "Zhang and Scaramuzza, IROS 2018, sec. III; Klenk et al., DEVO, 3DV 2024",
+        "Zhang and Scaramuzza, IROS 2018; Klenk et al., DEVO, 3DV 2024",
         "sim3",
     ),
     "se3": Protocol(
         "ATE after SE(3) of the positions, and RPE: metres are judged too",
-        "Sturm et al., IROS 2012, sec. VI",
+        "Sturm et al., IROS 2012",
         "se3",
     ),
     "first_pose": Protocol(
         "ATE with one pose laid on the truth's, the first or that at --align_at, and RPE: all drift counts",
-        "evo, align_origin; Zhang and Scaramuzza, IROS 2018, sec. III",
+        "evo, align_origin; Zhang and Scaramuzza, IROS 2018",
         "pose",
     ),
     "cmax_slam": Protocol(
         "absolute and relative rotation error with one pose laid on the truth's, the first or that at --align_at",
-        "Guo and Gallego, CMax-SLAM, T-RO 2024, sec. VI; on the Event Camera Dataset they take the first 30 s: --to 30",
+        "Guo and Gallego, CMax-SLAM, T-RO 2024; of the Event Camera Dataset their fig. 6 shows the first 30 s: --to 30",
         "pose",
         turning=True,
     ),

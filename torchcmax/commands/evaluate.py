@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from torchcmax.commands.arguments import made
 from torchcmax.config import Parser, UsageError, command, usage
-from torchcmax.evaluate import EvaluateOptions, Row, evaluate, read_run, write_csv
+from torchcmax.evaluate import ALL, EvaluateOptions, Row, evaluate, read_run, write_csv
 from torchcmax.folder import EVALUATION, writing
 from torchcmax.io import DataError
 from torchcmax.io.truth import REMEDY, read_truth
@@ -73,35 +73,33 @@ def run(config: Namespace) -> int:
                 raise DataError(place, "does not say where its ground truth is", REMEDY)
             where = Path(config.truth or str(run.recording))
             run = run if len(places) == 1 else dataclasses.replace(run, name=str(place))
-            asked = tuple(name for name, p in PROTOCOLS.items() if not run.lacks(p)) if names == ("all",) else names
-            found = evaluate(run, *truth_of(where), where, asked, options)
+            found = evaluate(run, *truth_of(where), where, names, options)
+            rows += found.rows
+            told.append({"truth": str(where), "offset_s": found.offset, "offset_found": found.found, "results": found.rows})
+            if found.found and not config.json:
+                print(f"offset: {found.offset:.6f} s are added to the times of {place}")
             if place.is_dir():
                 found.save(place)
                 write_page(place)
         except DataError as error:
-            if len(places) == 1:
+            if len(places) == 1 and not rows:
                 raise
             print(f"torchcmax evaluate: {error}", file=sys.stderr)
             failed += 1
-            continue
-        rows += found.rows
-        told.append({"truth": str(where), "offset_s": found.offset, "offset_found": found.found, "results": found.rows})
-        if found.found and not config.json:
-            print(f"offset: {found.offset:.6f} s are added to the times of {place}")
+    if config.json or rows:
+        print(json.dumps(told, indent=1) if config.json else table(rows))
+    if len(places) == 1 and places[0].is_dir() and not config.json and not failed:
+        print("\n".join(f"evaluation: {places[0] / name}" for name in EVALUATION))
     if config.csv and rows:
         with writing(Path(config.csv)) as temporary:
             write_csv(temporary, rows)
-    if config.json or rows:
-        print(json.dumps(told, indent=1) if config.json else table(rows))
-    if len(places) == 1 and places[0].is_dir() and not config.json:
-        print("\n".join(f"evaluation: {places[0] / name}" for name in EVALUATION))
     return 1 if failed else 0
 
 
 def _protocols(text: str) -> tuple[str, ...]:
-    """Names of protocols, or ("all",), or () for the usual ones."""
+    """Names of protocols, or `ALL`, or () for the usual ones."""
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    if names in ((USUAL,), ("all",)):
+    if names in ((USUAL,), ALL):
         return () if names == (USUAL,) else names
     unknown = [name for name in names if name not in PROTOCOLS]
     if unknown or not names:
