@@ -258,6 +258,14 @@ def test_decimal_numbers_have_the_unit_that_is_told(tmp_path, unit, times):
     same(read(tmp_path / "a.csv", camera="pinhole"), [[times[0], 5, 2, 1], [times[1], 5, 7, 0]])
 
 
+def test_columns_that_are_aligned_are_not_read_line_by_line(tmp_path, monkeypatch):
+    from torchcmax.io import text as module
+
+    monkeypatch.setattr(module, "_by_line", lambda *_: pytest.fail("line by line"))
+    (tmp_path / "a.txt").write_text("# t_us x y p\n" + "".join(f"{t:8d} {x:3d} {y:3d} {p:2d}\n" for t, x, y, p in rows()))
+    same(read(tmp_path / "a.txt", camera="pinhole"), rows())
+
+
 def test_what_stands_between_columns_is_the_same_in_every_line_or_refused(tmp_path):
     (tmp_path / "a.csv").write_text("# t_us x y p\n1, 5, 2, 1\n2,5 5, 2, 1\n")
     refused(tmp_path / "a.csv", "line 3", "'5 5' is not a number", camera="pinhole")
