@@ -67,6 +67,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", nargs="+")
     parser.add_argument("--starts", type=int, default=1, help="moments to start from, spread over each recording")
+    parser.add_argument("--at", type=float, nargs="+", metavar="SECOND", help="of the recording's clock to start from, instead")
     parser.add_argument("--threads", type=int, default=0, help="of the CPU's kernels; 0: as torch")
     parser.add_argument("--camera", default="", help="calibration where there is none, or the word pinhole")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="options of tracking, like mapping.overlap=0.7")
@@ -83,7 +84,7 @@ def main() -> int:
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
     for name in options.recording:
         recording = open(name, OpenOptions(camera=options.camera))
-        for begin in moments(recording, options.starts):
+        for begin in options.at or moments(recording, options.starts):
             try:
                 found = row(recording, slam, begin)
             except DataError as error:

@@ -1,5 +1,6 @@
 """Whole recordings with the default options: the bars that the project set itself."""
 
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -25,20 +26,28 @@ BARS = {  # % of the plane's distance, degrees, coverage
 }
 
 
+STARTS = {"slider_far_sim": (0.0, 0.01, 0.02)}  # s; of the others the beginning
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_simulated_recordings_are_tracked_from_nothing_to_the_end(shared, name):
-    """In a process of its own, as a user runs it: on slider_far_sim the last bit decides how the plane leans (docs/benchmarks.md), and
-    it depends on where in memory the tests before have left room."""
+    """In a process of its own, as a user runs it.
+
+    slider_far_sim moves along itself, and the last bit of a number, which is another on another processor, decides how its plane leans
+    (docs/benchmarks.md): it is judged by the median of some starts.
+    """
     command = [sys.executable, SCRIPT, shared / "data/sim" / name, "--threads", "2"]
+    command += ["--at", *map(str, STARTS[name])] if name in STARTS else []
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
-    head, _, line = (row.strip("| ").split(" | ") for row in done.stdout.splitlines()[:3])
-    found = dict(zip(head, (cell.strip() for cell in line), strict=True))
+    head, _, *lines = ([cell.strip() for cell in row.strip("| ").split(" | ")] for row in done.stdout.splitlines() if row.startswith("|"))
+    runs = [dict(zip(head, line, strict=True)) for line in lines]
+    assert len(runs) == len(STARTS.get(name, (0.0,)))
     percent, degrees, coverage = BARS[name]
-    assert float(found["lost_s"]) == 0
-    assert float(found["position_%"]) < percent
-    assert float(found["orientation_deg"]) < degrees
-    assert float(found["coverage"]) >= coverage
+    assert all(float(found["lost_s"]) == 0 for found in runs)
+    assert statistics.median(float(found["position_%"]) for found in runs) < percent
+    assert statistics.median(float(found["orientation_deg"]) for found in runs) < degrees
+    assert all(float(found["coverage"]) >= coverage for found in runs)
 
 
 def sharpness(image, weight):

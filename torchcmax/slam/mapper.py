@@ -39,7 +39,7 @@ class Keyframing:
     """How it is estimated from them."""
     thinned: int = 6000
     """Events of each of them that are used at most."""
-    settle: int = 8
+    settle: int = 16
     """Rounds of joint optimization of the first keyframes."""
     overlap: float = 0.8
     """A window of which less is known becomes a keyframe."""
