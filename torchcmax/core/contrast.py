@@ -19,6 +19,11 @@ def blur(image: Tensor, sigma: float) -> Tensor:
     return blurred
 
 
+def blur_twin(image: Tensor, sigma: float) -> Tensor:
+    """The readable twin of `blur`, in plain torch operations."""
+    return _smooth(_smooth(image, sigma, -2), sigma, -1) if sigma > 0 else image
+
+
 class _Blur(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, sigma: float) -> Tensor:
@@ -27,7 +32,7 @@ class _Blur(torch.autograd.Function):
             smoothed: Tensor = fast.smooth(image, sigma)
             return smoothed
         together = max(1, len(image)) if image.is_cuda else 1  # on the CPU one image at a time stays in the cache
-        return torch.cat([_smooth(_smooth(part, sigma, -2), sigma, -1) for part in image.split(together)])
+        return torch.cat([blur_twin(part, sigma) for part in image.split(together)])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
