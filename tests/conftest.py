@@ -70,3 +70,8 @@ def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp("small") / "poster"
     write(Simulation(duration=0.5, width=120, height=90, focal=100), folder)
     return folder
+
+
+def pytest_collection_modifyitems(items):
+    """The longest file goes first, so that at the end no process waits for it."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")
