@@ -26,8 +26,10 @@ SIZES = {  # px of the sensors that old headers name only by the plugin of the c
 WANTS = "a RAW file's header names its format: % evt 2.0, 2.1 or 3.0, or % format EVT2, EVT21 or EVT3"
 AGAIN = "copy or record the file again"
 EVT3_WORDS = 1 << 15  # taken apart at once
-IS_EVENT = np.array([0, 0, 1, 0, 1, 1, *[0] * 10], np.uint8)  # of EVT3's kinds of words: a single event, a vector of 12, of 8
-STEPS = np.array([0, 0, 0, 0, 12, 8, *[0] * 10], np.uint8)  # columns that its vectors pass
+IS_EVENT = np.array([0, 0, 1, 0, 1, 1, *[0] * 10], bool)  # of EVT3's kinds of words: a single event, a vector of 12, of 8
+STEPS = np.array([0, 0, 0, 0, 12, 8, *[0] * 10], np.int64)  # columns that its vectors pass
+FLAGS = np.array([0, 0, 0, 0, 0xFFF, 0xFF, *[0] * 10], np.uint16)  # bits of its vectors that are pixels
+UNKNOWN = np.array([0, 1, *[0] * 7, 1, 0, 1, 1, 1, 0, 0], bool)
 
 
 @dataclass
@@ -214,8 +216,8 @@ def _evt3(word: np.ndarray, gate: Gate) -> Events:
     carried = np.array([0x6000 | rest.get("low", 0), rest.get("row", 0), 0x3000 | rest.get("base", 0)], "<u2")
     word = np.concatenate([carried, word])
     kind, value = (word >> 12).astype(np.uint8), word & np.uint16(0xFFF)
-    told = IS_EVENT.take(kind)
-    passed = np.cumsum(told, dtype=np.int32)  # events up to each word
+    both = np.cumsum((STEPS << 32 | IS_EVENT).take(kind))  # two sums at once: it is their number that costs time
+    passed, columns = both & 0xFFFFFFFF, both >> 32  # events up to each word; columns that vectors passed, with it
 
     def state(here: np.ndarray, values: np.ndarray) -> np.ndarray:
         """What was told last, at each event: the words that tell it, and what they tell, with that before the first of them."""
@@ -225,18 +227,15 @@ def _evt3(word: np.ndarray, gate: Gate) -> Events:
     places = {k: np.flatnonzero(kind == k) for k in (6, 0, 3, 8)}
     low, row, base = (state(places[k][1:], value[places[k]]) for k in (6, 0, 3))
     start = state(places[8], _unrolled_from(gate, value[places[8]]))
-    steps = STEPS.take(kind)
-    columns = np.cumsum(steps, dtype=np.int32)  # that vectors passed up to each word, and with it
-    source = np.flatnonzero(told.view(bool))
-    flags, single = value[source], kind[source] == 2
-    ahead = columns[source] - steps[source] - state(places[3][1:], columns[places[3]])
-    x = np.where(single, flags & 0x7FF, (base & 0x7FF) + ahead.astype(np.uint16))
-    p = (np.where(single, flags, base) >> 11).astype(np.uint8)
-    flags[kind[source] == 5] &= 0xFF
-    flags[single] = 1
+    source = np.flatnonzero(IS_EVENT.take(kind))
+    told, single = value[source], kind[source] == 2
+    ahead = columns[source - 1] - state(places[3][1:], columns[places[3]])
+    x = np.where(single, told & 0x7FF, (base & 0x7FF) + ahead.astype(np.uint16))
+    p = (np.where(single, told, base) >> 11).astype(np.uint8)
+    flags = (value & FLAGS.take(kind))[source] | single
     bit = np.flatnonzero(np.unpackbits(flags.view(np.uint8), bitorder="little").view(bool))  # of bytes it takes four times as long
     which = bit >> 4
-    gate.unknown += int(np.bincount(kind, minlength=16)[[1, 9, 11, 12, 13]].sum())
+    gate.unknown += int(np.count_nonzero(UNKNOWN.take(kind)))
     last = places[3][-1]
     position = (int(value[last]) & 0x7FF) + int(columns[-1] - columns[last])  # where the next vector begins
     gate.rest = {"low": int(value[places[6][-1]]), "row": int(value[places[0][-1]])}
