@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 LAYER = {
-    "kernels": 0, "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "board": 3,
+    "kernels": 0, "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "data": 3, "board": 3,
     "rig": 3, "score": 3, "folder": 3, "picture": 3, "mapfile": 3, "mapimage": 3, "quality": 3, "chart": 3, "protocols": 3,
     "velocity": 3, "panoimage": 4, "config": 4, "track": 4, "resultfiles": 4, "alignment": 4, "evaluate": 5, "judge": 5,
     "tracktable": 5, "resultplots": 5, "job": 5, "page": 6, "workers": 6, "cluster": 6, "batch": 6, "report": 7, "trackreport": 7,
