@@ -1,8 +1,8 @@
 """Benchmark tables: scripts/run python scripts/bench.py [--recording REC] [--device cpu] [--json FILE]
 
-(a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) reading files;
-(e) memory; (f) what the device can do at best, measured in the same run.  Ratios within one run are to be trusted; absolute times
-depend on the machine and on who else works on it.
+(a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) a step of the
+flow's loss, and reading files; (e) memory; (f) what the device can do at best, measured in the same run.  Ratios within one run are
+to be trusted; absolute times depend on the machine and on who else works on it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -29,13 +30,16 @@ import torch
 from torchcmax import __version__, kernels
 from torchcmax.compensate import Compensation, compensate, load_kernels
 from torchcmax.core.camera import Canvas
+from torchcmax.core.contrast import blur_twin
 from torchcmax.core.draw import Ink, draw_twin
 from torchcmax.core.estimate import Estimate, Search, estimate
 from torchcmax.core.model import MODELS, Planar
 from torchcmax.core.objective import Look, View, objective
+from torchcmax.core.vote import vote_scatter
 from torchcmax.core.window import Window
 from torchcmax.folder import writing
 from torchcmax.io import DataNote, Events, OpenOptions, Recording, open, save
+from torchcmax.nn import FlowContrastLoss
 from torchcmax.simulator import Simulation, write
 
 Table = list[dict[str, object]]
@@ -206,6 +210,24 @@ def used(device: str) -> float:
     return next((float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM")), float("nan"))
 
 
+def flow_steps(recording: Recording, window: Window, device: str) -> Table:
+    """A step of training with FlowContrastLoss, forth and back, against the same loss written with four scatter_add and a plain blur."""
+    loss, rows = FlowContrastLoss(recording.camera), list[dict[str, object]]()
+    flow = torch.zeros(len(window), 2, *recording.camera.size, device=device, requires_grad=True)
+
+    def step() -> None:
+        flow.grad = None
+        loss(window, flow).backward()
+
+    fast = {name: best(step, device)[i] for i, name in enumerate(("wall", "CPU"))}
+    with patch("torchcmax.nn.flow.vote", vote_scatter), patch("torchcmax.nn.loss.blur", blur_twin):
+        plain = {name: best(step, device)[i] for i, name in enumerate(("wall", "CPU"))}
+    for name, seconds in fast.items():
+        times = {"ms": round(seconds * 1e3, 1), "scatter_add ms": round(plain[name] * 1e3, 1), "ratio": round(plain[name] / seconds, 2)}
+        rows.append({"windows": len(window), "time": name, **times})
+    return rows
+
+
 def reading(recording: Recording, folder: Path, count: int = 1_000_000) -> Table:
     """Mega-events a second that each form of the same events is read at, checks included, on one core."""
     once = Events.join(list(recording.chunks()))
@@ -294,6 +316,7 @@ def tables_of(recordings: list[Recording], folder: Path, windows: int, device: s
         tables[f"A cold window of 30,000 events of {recording.name}"] = cold_windows(recording, window, device)
     for recording in recordings:
         tables[f"The whole of {recording.name}"] = whole_recording(recording, device, threads)
+    tables["FlowContrastLoss, a step"] = flow_steps(recordings[0], first, device)
     tables["Reading, one core"] = reading(recordings[0], folder)
     tables["Memory"] = memory(recordings[0], device)
     tables["What the device can do"] = limits(recordings[0], first, device)

@@ -90,17 +90,24 @@ class FlowContrastLoss(Module):
 
     def _cost(self, flow: Tensor) -> Tensor:
         """Smoothness and guard: [B]."""
-        here = flow[:, :, :-1, :-1]
-        (ux, vx), (uy, vy) = ((there - here).unbind(1) for there in (flow[:, :, :-1, 1:], flow[:, :, 1:, :-1]))
-        cost = torch.zeros_like(ux[:, 0, 0])
+        cost = torch.zeros_like(flow[:, 0, 0, 0])
         if self.smoothness > 0:
+            (ux, vx), (uy, vy) = _gradient(flow, 1)
             cost = cost + self.smoothness * ((ux * ux + vx * vx + uy * uy + vy * vy + SOFT**2).sqrt().mean((1, 2)) - SOFT)
         if self.guard > 0:
+            (ux, vx), (uy, vy) = _gradient(flow, 2)  # side by side, so that every pixel is in one
             trace, area = ux + vy, ux * vy - uy * vx
             for reach in (max(self.references), min(self.references) - 1):  # to the farthest references from both ends of the window
                 excess = (1 + reach * trace + reach**2 * area).clamp_min(SMALLEST).log().abs() - math.log(self.deformation)
                 cost = cost + self.guard / 2 * excess.clamp_min(0).square().mean((1, 2))
         return cost
+
+
+def _gradient(flow: Tensor, step: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Of the flow [B, 2, H, W] to the right and down, in squares of 2 by 2 pixels that begin every `step` pixels: (u, v)_x, (u, v)_y."""
+    here = flow[:, :, :-1:step, :-1:step]
+    right, down = flow[:, :, :-1:step, 1::step], flow[:, :, 1::step, :-1:step]
+    return (right - here).unbind(1), (down - here).unbind(1)
 
 
 def sampled(flow: Tensor, xy: Tensor) -> Tensor:
