@@ -286,9 +286,19 @@ def test_a_broken_batch_stops_no_other_folder(tmp_path, capsys):
     assert out == f"report: {alone}/report.html\n"
 
 
-def test_report_of_a_folder_without_a_run_is_an_error(tmp_path):
-    with pytest.raises(DataError, match=r"has no summary\.json"):
-        report.run(report.build().parse_args([str(tmp_path)]))
+def test_results_that_are_broken_are_told_also_where_the_page_of_their_batch_cannot_be_written(tmp_path, capsys):
+    batch(tmp_path)
+    (tmp_path / "poster 1" / "summary.json").write_text("{")
+    (tmp_path / "report.html").mkdir()
+    assert report.run(report.build().parse_args([str(tmp_path)])) == 1
+    err = capsys.readouterr().err
+    assert "poster 1/summary.json: cannot be read" in err
+    assert f"{tmp_path}/report.html: cannot be written" in err
+
+
+def test_report_of_a_folder_without_a_run_is_an_error(tmp_path, capsys):
+    assert report.run(report.build().parse_args([str(tmp_path)])) == 1
+    assert "has no summary.json" in capsys.readouterr().err
 
 
 def test_a_batch_never_reaches_out_of_its_folder(tmp_path):

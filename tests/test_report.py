@@ -235,3 +235,16 @@ def test_what_cannot_be_written_at_the_end_keeps_nothing_else_from_being_written
     assert json.loads((tmp_path / "summary.json").read_text())["windows"] == 3
     assert (tmp_path / "windows.csv").is_file()
     assert (tmp_path / "report.html").is_file()
+
+
+def test_a_run_that_was_killed_gives_way_to_the_next(results, tmp_path):
+    recording, options, parts = results
+    killed = Report(tmp_path, recording, options, "", 1)
+    killed.add(*parts[0])
+    assert "killed" in json.loads((tmp_path / "summary.json").read_text())["stopped_by"]
+    assert not (tmp_path / "windows.csv").exists()
+    with Report(tmp_path, recording, options, "", 0) as again:
+        again.add(*parts[0])
+    assert json.loads((tmp_path / "summary.json").read_text())["complete"]
+    assert not list((tmp_path / "images").glob("*.png"))
+    assert not list(tmp_path.glob(".*"))

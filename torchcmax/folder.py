@@ -19,6 +19,7 @@ from torchcmax.io import DataError, Recording
 SUMMARY, WINDOWS, PICTURES = "summary.json", "windows.csv", "window_*.png"
 PAGE = "report.html"
 EVALUATION = ("evaluation.json", "evaluation.csv")  # of `evaluate`, about the run that is there
+RUNNING = "it is still running, or was killed"  # what a summary says until the end
 LIVE = ".windows.live.csv"  # the table while a run goes on
 TRACKED = ("trajectory.txt", "truth.txt", "keyframes.csv", "map.png", "map.h5")  # of `track` only
 TURNED = ("trajectory.txt", "truth.txt", "keyframes.csv", "panorama.png", "panorama_cropped.png", "panorama.h5")  # of `panorama` only

@@ -20,7 +20,7 @@ from torchcmax.core.estimate import Estimate
 from torchcmax.core.objective import REFERENCES
 from torchcmax.core.warp import still
 from torchcmax.core.window import Window
-from torchcmax.folder import COLUMNS, LIVE, SUMMARY, WHOLE, WINDOWS, cell, check_place, clear, unwritable, versions, writing
+from torchcmax.folder import COLUMNS, LIVE, RUNNING, SUMMARY, WHOLE, WINDOWS, cell, check_place, clear, unwritable, versions, writing
 from torchcmax.io import DataError, Recording
 from torchcmax.page import write_page
 from torchcmax.picture import captioned, pictures, png
@@ -70,6 +70,7 @@ class Report:
         self._lines.writerow(COLUMNS)
         board = Board(self.folder)
         board.config(self.config)
+        self._summarize(RUNNING)
         return board
 
     def add(self, window: Window, estimate: Estimate) -> None:
@@ -126,8 +127,7 @@ class Report:
         stopped, failed = None if kind is None else f"{kind.__name__}: {error}", None
         for last in (
             self.board.close,
-            self._csv.close,
-            self._name_table,
+            self._close_table,
             partial(self._summarize, stopped),
             lambda: write_page(self.folder),
         ):
@@ -138,7 +138,9 @@ class Report:
         if failed is not None and error is None:  # else the first error is the one to tell
             raise failed if isinstance(failed, DataError) else unwritable(self.folder, failed) from failed
 
-    def _name_table(self) -> None:
+    def _close_table(self) -> None:
+        """The table gets its name when all of it is written; else it stays as one that a run is still writing."""
+        self._csv.close()
         (self.folder / LIVE).replace(self.folder / WINDOWS)
 
     def _summarize(self, stopped: str | None) -> None:

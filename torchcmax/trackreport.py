@@ -23,7 +23,7 @@ from torchcmax.core.camera import Canvas
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Pose, Trajectory
 from torchcmax.core.warp import TERMS, polynomial, still
-from torchcmax.folder import COLUMNS, LIVE, SUMMARY, TRACKED, WINDOWS, check_place, clear, unwritable, versions, writing
+from torchcmax.folder import COLUMNS, LIVE, RUNNING, SUMMARY, TRACKED, WINDOWS, check_place, clear, unwritable, versions, writing
 from torchcmax.io import DataError
 from torchcmax.io.trajectory import write_trajectory
 from torchcmax.judge import Judge, on_cpu
@@ -38,7 +38,6 @@ from torchcmax.tracktable import KEYFRAMES, POSE, SIGNS, TABLE, Row, cells, keyf
 
 SHOWN = [*COLUMNS[4:], *(name for name in SIGNS if name != "weakest")]  # of the table, on the board
 STATUS = {"ok": 0.0, "weak": 1.0, "lost": 2.0, "start": 3.0, "still": 4.0}
-RUNNING = "it is still running, or was killed"
 SHOW = 1.0  # s between moments at which what is done can be seen
 SMALL = 1024  # px of the map on the board
 

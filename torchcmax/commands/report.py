@@ -35,19 +35,16 @@ def run(config: Namespace) -> int:
     failed: list[DataError] = []
     for folder in folders:
         try:
-            failed += _made(folder)
+            _make(folder, failed)
         except DataError as error:  # the others must be seen
-            if len(folders) == 1:
-                raise
             failed.append(error)
     for one in failed:
         print(f"torchcmax report: {one}", file=sys.stderr)
     return 1 if failed else 0
 
 
-def _made(folder: Path) -> list[DataError]:
-    """Make the page of a result, or the pages of a batch; those of its results that cannot be made."""
-    failed = []
+def _make(folder: Path, failed: list[DataError]) -> None:
+    """Make the page of a result, or the pages of a batch; failed: gets what is wrong with results whose pages cannot be made."""
     if inside(folder, BATCH):
         for place in finished(folder):
             try:
@@ -55,4 +52,3 @@ def _made(folder: Path) -> list[DataError]:
             except DataError as error:
                 failed.append(error)
     print(f"report: {write_batch_page(folder, batch_rows(folder)) if inside(folder, BATCH) else write_page(folder)}")
-    return failed

@@ -212,6 +212,7 @@ def save(recording: Recording, path: Path | str, progress: Callable[[int], objec
     try:
         if not path.parent.is_dir():
             raise DataError(path, f"{path.parent} is no folder", "make the folder first, or choose another")
+        _check_room(path.parent, 64 * len(recording.truth) if recording.truth is not None else 0)
         with h5py.File(part, "w") as file:
             _write_rest(file, recording)
             _write_events(file.create_group("events"), recording, path.parent, progress)
@@ -222,6 +223,12 @@ def save(recording: Recording, path: Path | str, progress: Callable[[int], objec
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def _check_room(folder: Path, size: int) -> None:
+    """There is room for so many bytes."""
+    if shutil.disk_usage(folder).free < size + SPARE:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def _write_rest(file: Any, recording: Recording) -> None:
@@ -244,8 +251,7 @@ def _write_events(group: Any, recording: Recording, folder: Path, progress: Call
     columns = {name: group.create_dataset(name, (0,), kind, maxshape=(None,), **packed) for name, kind in NAMES.items()}
     count = 0
     for chunk in recording.chunks():
-        if shutil.disk_usage(folder).free < BYTES_PER_EVENT * len(chunk) + SPARE:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+        _check_room(folder, BYTES_PER_EVENT * len(chunk))
         for name, column in columns.items():
             column.resize((count + len(chunk),))
             column[count:] = getattr(chunk, name)
