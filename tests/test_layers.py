@@ -6,11 +6,11 @@ from pathlib import Path
 LAYER = {
     "kernels": 0, "core": 1, "io": 2, "slam": 2, "simulator": 3, "sensor": 3, "texture": 3, "compensate": 3, "nn": 3, "data": 3, "board": 3,
     "rig": 3, "score": 3, "folder": 3, "picture": 3, "mapfile": 3, "mapimage": 3, "quality": 3, "chart": 3, "protocols": 3,
-    "velocity": 3, "panoimage": 4, "config": 4, "track": 4, "resultfiles": 4, "alignment": 4, "evaluate": 5, "judge": 5,
+    "velocity": 3, "path": 3, "panoimage": 4, "config": 4, "track": 4, "resultfiles": 4, "alignment": 4, "evaluate": 5, "judge": 5,
     "tracktable": 5, "resultplots": 5, "job": 5, "page": 6, "workers": 6, "cluster": 6, "batch": 6, "report": 7, "trackreport": 7,
     "batchpage": 7, "panoreport": 8, "commands": 9, "cli": 10,
 }  # fmt: skip
-ABOVE = {("simulator", "texture"), ("simulator", "sensor")}  # three files of one thing
+ABOVE = {("simulator", "texture"), ("simulator", "sensor"), ("simulator", "path")}  # four files of one thing
 ORDER = [
     "so3", "pose", "plane", "camera", "window", "warp", "state", "vote", "draw", "contrast", "minimize", "model", "objective", "estimate",
     "match", "joint",
@@ -53,6 +53,12 @@ def test_core_is_a_chain_and_knows_torch_and_kornia_only():
             if name[:2] == ["torchcmax", "core"] and path.stem in ORDER:
                 other = name[2]
                 assert ORDER.index(other) < ORDER.index(path.stem), f"core/{path.name} must not import {other}"
+
+
+def test_the_rig_knows_nothing_of_the_rest():
+    for path in (ROOT / "rig").glob("*.py"):
+        for name in imported(path):
+            assert name[0] != "torchcmax" or name[1] == "rig", f"rig/{path.name} must not import {'.'.join(name)}"
 
 
 def test_every_file_of_the_core_is_in_the_chain():

@@ -8,7 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,8 @@ from torchcmax.core.pose import Motion, Pose, Trajectory
 from torchcmax.io.errors import DataError
 from torchcmax.io.hdf5 import save
 from torchcmax.io.recording import Events, Recording
-from torchcmax.io.trajectory import write_plane, write_trajectory, write_velocity
+from torchcmax.io.trajectory import read_trajectory, write_plane, write_trajectory, write_velocity
+from torchcmax.path import Path as CameraPath
 from torchcmax.sensor import Response, Sensor
 from torchcmax.texture import SCENES, texture, view
 
@@ -59,7 +60,8 @@ README = """# {name}
 * events.h5: events/t int64 us, sorted; events/x, events/y (column, row) raw distorted pixels; events/p 1 = brighter, 0 = darker;
   with calibration, ground truth and plane, so that it can stand alone; opened as a folder, the text files count
 * calib.txt: fx fy cx cy k1 k2 p1 p2 k3, as OpenCV; pixel centres at integers
-* groundtruth.txt (1 kHz): t tx ty tz qx qy qz qw, camera to world, metres; x right, y down, z forward; the world is the first camera
+* groundtruth.txt (1 kHz): t tx ty tz qx qy qz qw, camera to world, metres; x right, y down, z forward; the world is the first camera,
+  or that of the trajectory
 * velocity.txt (1 kHz): t vx vy vz wx wy wz in the camera's frame, m/s and rad/s, from the closed form of the path
 * plane.txt (not with a panorama): nx ny nz d with n . X + d = 0 in the world, n unit and towards the camera
 * texture.png: the log intensity, reduced, to look at
@@ -80,6 +82,9 @@ class Simulation:
     motion: str = "6dof"
     """How the camera moves: 6dof, translation, rotation, slider (constant velocity along x), or sweep (round and round at 120 deg/s, with
     nods); a panorama wants rotation or sweep."""
+    trajectory: str = ""
+    """Path of a file of poses to follow instead, smoothly: lines t tx ty tz qx qy qz qw, s, m, camera to world, as a rig's ground truth has
+    them. Clock, duration and world are those of the file; the plane lies before its first camera."""
     duration: float = 1.0
     """Length of the recording, s: 0.001 to 600."""
     speed: float = 1.0
@@ -114,9 +119,13 @@ class Simulation:
             raise ValueError(_unknown("scene", self.scene, SCENES, ", or the path of a picture"))
         if self.motion not in MOTIONS:
             raise ValueError(_unknown("motion", self.motion, MOTIONS))
-        if self.scene == "panorama" and self.motion not in ("rotation", "sweep"):
+        if self.path is not None:
+            if self.speed != 1:
+                raise ValueError(f"a trajectory has a speed of its own: speed wants 1, got {self.speed}")
+            object.__setattr__(self, "duration", float(self.path.time[-1]))
+        elif self.scene == "panorama" and self.motion not in ("rotation", "sweep"):
             raise ValueError(f"a panorama is infinitely far and shows rotation only: motion wants rotation or sweep, got {self.motion!r}")
-        if self.motion == "sweep" and self.scene != "panorama":
+        elif self.motion == "sweep" and self.scene != "panorama":
             raise ValueError(f"a sweep goes round and wants something to see everywhere: scene wants panorama, got {self.scene!r}")
         for name, (least, most, unit) in LIMITS.items():
             if not least <= getattr(self, name) <= most and not (name == "bandwidth" and self.bandwidth == 0):
@@ -125,6 +134,24 @@ class Simulation:
         if len(self.tilt) != 2 or not all(abs(a) < 60 for a in self.tilt):
             raise ValueError(f"tilt wants two angles between -60 and 60 deg, got {self.tilt}")
         _ = self.camera  # it checks the rest
+        plane = self.plane
+        if plane is not None and self.path is not None and plane.seen_from(self.path.pose[:1].inverse()).distance <= 0:
+            raise ValueError(
+                f"{self.trajectory}: the origin of its world would lie behind the plane: take a larger distance than {self.distance} m, "
+                "or another world"
+            )
+
+    @cached_property
+    def path(self) -> CameraPath | None:
+        """What the trajectory's file holds; None without one."""
+        return CameraPath.through(read_trajectory(Path(self.trajectory))) if self.trajectory else None
+
+    @property
+    def origin(self) -> Pose:
+        """The first camera [1] in the world of the recording."""
+        if self.path is not None:
+            return self.path.pose[:1]
+        return Pose(torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
 
     @property
     def camera(self) -> Camera:
@@ -139,7 +166,7 @@ class Simulation:
 
     @property
     def plane(self) -> Plane | None:
-        """In the world frame, m; the panorama has none."""
+        """In the first camera's frame, m; the panorama has none."""
         if self.scene == "panorama":
             return None
         normal = Plane.tilted(torch.tensor([self.tilt], dtype=torch.float64).deg2rad()).normal
@@ -172,13 +199,17 @@ def _sweep(options: Simulation) -> Tensor:
 
 
 def pose(options: Simulation, time: Tensor) -> Pose:
-    """T_wc in closed form: time [M] s, float64 -> Pose [M], m."""
+    """In the first camera's frame, in closed form: time [M] s since the start, float64 -> Pose [M], m."""
+    if options.path is not None:
+        return options.origin.inverse() @ options.path.at(time)[0]
     turn = so3.exp(_waves(options, time, 1)[0])
     return Pose(so3.exp(_sweep(options) * time[:, None]) @ turn if options.motion == "sweep" else turn, _waves(options, time, 0)[0])
 
 
 def velocity(options: Simulation, time: Tensor) -> Motion:
-    """Velocity of the camera in its own frame, in closed form: time [M] s, float64 -> Motion [M], rad/s and m/s."""
+    """Velocity of the camera in its own frame, in closed form: time [M] s since the start, float64 -> Motion [M], rad/s and m/s."""
+    if options.path is not None:
+        return options.path.at(time)[1]
     (turn, turn_rate), (_, shift_rate) = _waves(options, time, 1), _waves(options, time, 0)
     omega = (so3.right_jacobian(turn) @ turn_rate[..., None])[..., 0]
     back = so3.exp(turn).mT
@@ -189,11 +220,18 @@ def simulate(options: Simulation) -> Recording:
     """The recording.  Its events are rendered as they are asked for, and are the same each time."""
     milliseconds = torch.arange(math.ceil(options.duration * 1000 - 1e-9) + 1)
     poses = [pose(options, part.double() / 1000) for part in milliseconds.split(BLOCK)]
-    truth = Trajectory(milliseconds * 1000, Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses])))
-    name = f"{options.scene if options.scene in SCENES else Path(options.scene).stem}_{options.motion}"
+    start, there = _start(options), options.origin @ Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses]))
+    truth, plane = Trajectory(start + milliseconds * 1000, there), options.plane
+    motion = Path(options.trajectory).stem if options.trajectory else options.motion
+    name = f"{options.scene if options.scene in SCENES else Path(options.scene).stem}_{motion}"
     frames = _frame_times(options)  # now, so that what cannot be simulated is said now
     chunks = partial(_chunks, options, frames)
-    return Recording(Path("simulated"), name, options.camera, chunks, None, truth, options.plane)
+    return Recording(Path("simulated"), name, options.camera, chunks, None, truth, plane and plane.seen_from(options.origin.inverse()))
+
+
+def _start(options: Simulation) -> int:
+    """µs of the recording's clock at which the camera starts."""
+    return options.path.start if options.path is not None else 0
 
 
 def _frame_times(options: Simulation) -> np.ndarray:
@@ -268,7 +306,8 @@ def _chunks(options: Simulation, frames: np.ndarray) -> Iterator[Events]:
             parts.append(Events(t, x.astype(np.uint16), y.astype(np.uint16), p))
             if k == len(times) - 1 or sum(map(len, parts)) >= CHUNK:
                 block, parts = Events.join(parts), []
-                yield block[block.t >= 0]
+                block = block[block.t >= 0]
+                yield replace(block, t=block.t + _start(options))
 
 
 def write(options: Simulation, folder: Path, progress: Callable[[float], None] | None = None) -> Path:
@@ -281,7 +320,7 @@ def write(options: Simulation, folder: Path, progress: Callable[[float], None] |
     part = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         part.mkdir(parents=True)
-        count = _write_events(part / "events.h5", recording, progress)
+        count = _write_events(part / "events.h5", recording, _start(options), progress)
         _write_texts(part, options, recording, count)
         if _target(folder).exists():  # asked again: it may have been filled meanwhile
             shutil.rmtree(target)
@@ -325,7 +364,7 @@ def _ours(folder: Path) -> bool:
         return False
 
 
-def _write_events(path: Path, recording: Recording, progress: Callable[[float], None] | None) -> int:
+def _write_events(path: Path, recording: Recording, start: int, progress: Callable[[float], None] | None) -> int:
     """events.h5, chunk by chunk: -> number of events."""
     count = 0
 
@@ -335,7 +374,7 @@ def _write_events(path: Path, recording: Recording, progress: Callable[[float], 
             yield chunk
             count += len(chunk)
             if progress is not None and len(chunk):
-                progress(float(chunk.t[-1]) * 1e-6)
+                progress(float(chunk.t[-1] - start) * 1e-6)
 
     save(replace(recording, chunks=counted), path)
     return count
@@ -346,7 +385,7 @@ def _write_texts(folder: Path, options: Simulation, recording: Recording, count:
     assert recording.truth is not None
     write_trajectory(folder / "groundtruth.txt", recording.truth)
     time = recording.truth.time
-    motions = [velocity(options, part.double() * 1e-6) for part in time.split(BLOCK)]
+    motions = [velocity(options, part.double() * 1e-6) for part in (time - _start(options)).split(BLOCK)]
     motion = Motion(torch.cat([m.omega for m in motions]), torch.cat([m.velocity for m in motions]))
     write_velocity(folder / "velocity.txt", time, motion)
     if recording.plane is not None:
