@@ -1,8 +1,8 @@
 """Benchmark tables: scripts/run python scripts/bench.py [--recording REC] [--device cpu] [--json FILE]
 
 (a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) a step of the
-flow's loss, and reading files; (e) memory; (f) what the device can do at best, measured in the same run.  Ratios within one run are
-to be trusted; absolute times depend on the machine and on who else works on it.
+flow's loss, reading files, and windows from a DataLoader; (e) memory; (f) what the device can do at best, measured in the same run.
+Ratios within one run are to be trusted; absolute times depend on the machine and on who else works on it.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from torch.utils.data import DataLoader
 
 from torchcmax import __version__, kernels
 from torchcmax.compensate import Compensation, compensate, load_kernels
@@ -37,6 +38,7 @@ from torchcmax.core.model import MODELS, Planar
 from torchcmax.core.objective import Look, View, objective
 from torchcmax.core.vote import vote_scatter
 from torchcmax.core.window import Window
+from torchcmax.data import WindowDataset, collate
 from torchcmax.folder import writing
 from torchcmax.io import DataNote, Events, OpenOptions, Recording, open, save
 from torchcmax.nn import FlowContrastLoss
@@ -253,6 +255,17 @@ def reading(recording: Recording, folder: Path, count: int = 1_000_000) -> Table
     return rows
 
 
+def loading(folder: Path, events: int = 30_000, batch: int = 4) -> Table:
+    """Mega-events a second that a DataLoader gives in windows at random places of the file of ours that `reading` wrote."""
+    rows: Table = []
+    for workers in (0, 1, 2):
+        dataset = WindowDataset(folder / "ours.h5", events, stride=events // 5)
+        loader = DataLoader(dataset, batch, shuffle=True, num_workers=workers, collate_fn=collate, persistent_workers=workers > 0)
+        taken, _ = best(lambda loader=loader: sum(1 for _ in loader), "cpu", 3)  # type: ignore[misc]
+        rows.append({"workers": workers, "windows": len(dataset), "Mev/s": round(len(dataset) * events / taken * 1e-6, 2)})
+    return rows
+
+
 def limits(recording: Recording, window: Window, device: str) -> Table:
     """(e) Copying, and torch adding to four pixels of an image for each event; and how we compare, reading events twice an evaluation."""
     canvas, model = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx)
@@ -318,6 +331,7 @@ def tables_of(recordings: list[Recording], folder: Path, windows: int, device: s
         tables[f"The whole of {recording.name}"] = whole_recording(recording, device, threads)
     tables["FlowContrastLoss, a step"] = flow_steps(recordings[0], first, device)
     tables["Reading, one core"] = reading(recordings[0], folder)
+    tables["Windows of 30,000 events at random from a DataLoader, four in a batch"] = loading(folder)
     tables["Memory"] = memory(recordings[0], device)
     tables["What the device can do"] = limits(recordings[0], first, device)
     return tables

@@ -19,6 +19,7 @@ class Contents:
     place: event, counted from 0 -> where it stands, in words | count: None where only reading all would tell
     name: of the recording; empty: as its path | own: a file of ours | sensor: (width, height) px as the file says, not checked
     since: µs, chunk -> how many events are left out at the beginning, all before that time, and the rest; of a file with an index
+    pieces: of a file that can be read anywhere: from event, to event -> those events as they stand there; each process opens its own file
     """
 
     events: Callable[[int], Iterator[Events]]
@@ -31,3 +32,4 @@ class Contents:
     truth: Trajectory | None = None
     plane: Plane | None = None
     since: Callable[[int, int], tuple[int, Iterator[Events]]] | None = None
+    pieces: Callable[[int, int], Events] | None = None

@@ -26,7 +26,7 @@ class Events:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, index: slice | np.ndarray) -> Events:
+    def __getitem__(self, index: int | slice | np.ndarray) -> Events:
         return Events(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @classmethod

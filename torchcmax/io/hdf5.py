@@ -31,13 +31,14 @@ from torchcmax.io.trajectory import checked_plane, checked_trajectory
 
 NAMES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 VERSION = 2  # 1 had no index
-STORED = 1 << 17  # events per compressed piece of a file
+STORED = 1 << 16  # events per compressed piece of a file
 WANTS = "it wants the datasets events/t (integer us), events/x, events/y (px), events/p (0 or 1), of the same length"
 REWRITE = "write the ground truth again, or take it out of the file"
 FAILURES = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, MemoryError)  # what h5py raises on broken files
 HEAP, SEARCHED = b"GCOL", 4 << 20  # how a heap of text begins; bytes in which it is looked for
 MANY = LARGE // 8  # numbers of a trajectory or an index
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+KEPT = 8 << 20  # bytes of each column that stay unpacked: neighbours are mostly in the same stored piece
 BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF5 crashes the process when it finds it full
 
 
@@ -98,7 +99,8 @@ def contents(path: Path) -> Contents:
         events, name = partial(read_events, path, layout=layout), str(file.attrs.get("name", ""))
         indexed = bool(layout.index) if layout else own and version == VERSION
         since = partial(_since, path, layout) if indexed else None
-        return Contents(events, lambda event: f"event {event + 1}", count, name, own, sensor, lens, truth, plane, since)
+        pieces = Pieces(path, layout)
+        return Contents(events, lambda event: f"event {event + 1}", count, name, own, sensor, lens, truth, plane, since, pieces)
 
 
 def _attribute(value: Any) -> Any:
@@ -179,11 +181,11 @@ def _since(path: Path, layout: Layout | None, time: int, chunk: int) -> tuple[in
 
 def _piece_before(path: Path, file: Any, time: int) -> int:
     """First event of the last stored piece that begins before a time, µs; 0 where none does."""
-    count, remedy = len(file["events/t"]), "convert the recording again"
+    count, stored, remedy = len(file["events/t"]), (file["events/t"].chunks or (1,))[0], "convert the recording again"
     index = numbers(path, file, "index", remedy, MANY)
-    if index.ndim != 1 or len(index) != -(-count // STORED) or (index[1:] < index[:-1]).any():
+    if index.ndim != 1 or len(index) != -(-count // stored) or (index[1:] < index[:-1]).any():
         raise DataError(path, f"its index of {index.size} times does not fit its {count} events", remedy)
-    return max(int(np.searchsorted(index, time)) - 1, 0) * STORED
+    return max(int(np.searchsorted(index, time)) - 1, 0) * stored
 
 
 def read_events(path: Path, chunk: int, layout: Layout | None = None, start: int = 0) -> Iterator[Events]:
@@ -192,13 +194,35 @@ def read_events(path: Path, chunk: int, layout: Layout | None = None, start: int
         with _file(path) as file:  # not held open between chunks: a yield within would blame the file for the caller's errors
             if start >= len(file[layout.columns["t"][0] if layout else "events/t"]):
                 return
-            if layout:
-                events = read_layout(path, file, layout, start, start + chunk)
-            else:
-                columns = {name: file["events"][name][start : start + chunk] for name in NAMES}
-                events = as_events(path, columns, start, seconds=False, prefix="events/")
+            events = _read(path, file, layout, start, start + chunk)
         yield events
         start += chunk
+
+
+def _read(path: Path, file: Any, layout: Layout | None, start: int, stop: int) -> Events:
+    if layout:
+        return read_layout(path, file, layout, start, stop)
+    return as_events(path, {name: file["events"][name][start:stop] for name in NAMES}, start, seconds=False, prefix="events/")
+
+
+class Pieces:
+    """The events of a file from one number to another, as they stand there.  Every process, and every copy, opens its own file."""
+
+    def __init__(self, path: Path, layout: Layout | None) -> None:
+        self._path, self._layout = path, layout
+        self._file: Any = None
+        self._process = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None}
+
+    def __call__(self, start: int, stop: int) -> Events:
+        try:
+            if self._file is None or self._process != os.getpid():  # HDF5 does not survive a fork
+                self._file, self._process = h5py.File(self._path, "r", rdcc_nbytes=KEPT), os.getpid()
+            return _read(self._path, self._file, self._layout, start, stop)
+        except FAILURES as error:
+            raise DataError(self._path, f"cannot be read as HDF5: {error}", AGAIN) from error
 
 
 def save(recording: Recording, path: Path | str, progress: Callable[[int], object] | None = None) -> None:

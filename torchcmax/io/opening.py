@@ -161,7 +161,7 @@ def _recording(path: Path, file: str, found: Contents, options: OpenOptions, fol
         before, rest = since(time, options.chunk)
         return before, checked(rest, replace(source, place=lambda event: source.place(before + event)))
 
-    return Recording(path, name, camera, chunks, found.count, truth, plane, guessed, later)
+    return Recording(path, name, camera, chunks, found.count, truth, plane, guessed, later, found.pieces)
 
 
 def _camera(folder: Member | None, found: Contents, file: str, options: OpenOptions) -> tuple[Camera, bool]:

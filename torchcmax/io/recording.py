@@ -26,6 +26,7 @@ class Recording:
     count is the number of events, None where only reading the whole file would tell.
     guessed: the sensor's size comes from the events alone, as nothing else told it.
     later: what `since` asks; None: all events are read.
+    pieces: from event, to event -> those events as they stand in a file that can be read anywhere, neither checked nor sorted.
     """
 
     path: Path
@@ -37,6 +38,7 @@ class Recording:
     plane: Plane | None = None
     guessed: bool = False
     later: Callable[[int], tuple[int, Iterator[Events]]] | None = None
+    pieces: Callable[[int, int], Events] | None = None
 
     def since(self, time: int) -> tuple[int, Iterator[Events]]:
         """How many events are left out, all before a time, µs, and the rest in chunks: quick where the file has an index by time."""
@@ -53,7 +55,7 @@ class Recording:
         if events < 2 or stride < 1 or batch < 1:
             raise ValueError(f"a window wants at least 2 events, a stride and batch of at least 1, got {events}, {stride}, {batch}")
         table = self.camera.rays().view(-1, 3).to(device, torch.float32)
-        for block in self._blocks(events, stride, batch):
+        for block in self.blocks(events, stride, batch):
             yield Packed.of(block, self.camera.size, device.type == "cuda").window(table)
 
     def stream(self, start: float | None = None, end: float | None = None, device: torch.device | str = "cpu") -> Stream:
@@ -64,7 +66,7 @@ class Recording:
         """
         return Stream(self, start, end, device)
 
-    def _blocks(self, events: int, stride: int, batch: int) -> Iterator[Events]:
+    def blocks(self, events: int, stride: int, batch: int) -> Iterator[Events]:
         """The events of `batch` windows at a time, [batch, events]; fewer windows only at the end."""
         parts: list[Events] = []
         waiting = skip = seen = 0
