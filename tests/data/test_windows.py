@@ -276,3 +276,21 @@ def test_a_file_that_is_cut_off_while_it_is_read_is_told(file):
 def test_memory_is_pinned(file):
     loader = DataLoader(WindowDataset(file, 100), 2, collate_fn=collate, pin_memory=True)
     assert next(iter(loader)).window.ray.is_pinned()
+
+
+def test_the_flow_is_what_the_loss_wants(tmp_path):
+    """Events that follow the true flow are as sharp as by the true motion, and sharper than half way there."""
+    from torchcmax.nn import ContrastLoss, FlowContrastLoss
+    from torchcmax.simulator import Simulation, simulate
+
+    recording = simulate(Simulation(duration=0.25, speed=2.0, noise=0.0))
+    sample = WindowDataset(recording, 8000)[4]
+    canvas = Canvas.around(recording.camera, 0.0)
+    by_flow = FlowContrastLoss(recording.camera, margin=0.25, smoothness=0.0, guard=0.0)
+    by_motion = ContrastLoss(recording.camera, references=(0.0, 0.5, 1.0), guard=0.0)(
+        sample.window, sample.omega, sample.velocity, sample.normal
+    )
+    flow = sample.flow(canvas)
+    losses = {share: by_flow(sample.window, share * flow).item() for share in (0.0, 0.5, 0.8, 1.0, 1.2)}
+    assert min(losses, key=losses.get) == 1.0, losses
+    assert losses[0.0] - losses[1.0] > 0.97 * (losses[0.0] - by_motion.item())
