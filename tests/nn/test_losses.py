@@ -15,6 +15,7 @@ from torchcmax.core.model import Rotation
 from torchcmax.core.objective import Look
 from torchcmax.core.window import Window
 from torchcmax.nn import Compensate, ContrastLoss, FlowContrastLoss, ImageOfWarpedEvents, Warp
+from torchcmax.nn.compensate import _Optimum
 
 CAMERA = Camera.pinhole((24, 32))
 OMEGA, VELOCITY, NORMAL = (0.5, -0.8, 1.5), (0.4, 0.2, -0.1), (0.1, -0.2, -math.sqrt(0.95))
@@ -247,6 +248,29 @@ def test_compensate_finds_what_the_estimator_finds():
     torch.testing.assert_close(found.omega, vector(OMEGA, dtype=torch.float32), rtol=0.1, atol=0.1)
     warm = Compensate(CAMERA)(window, start=vector(OMEGA, dtype=torch.float32))
     assert (warm.estimate.evaluations < found.estimate.evaluations).all()
+
+
+def test_gradients_through_the_optimum_of_an_objective_without_kinks():
+    """f = x' A x / 2 - b' x, with A of the weights and b of both inputs: the optimum is A^-1 b, and central differences are exact."""
+    chance = torch.Generator().manual_seed(0)
+    basis = torch.rand(3, 5, 4, generator=chance, dtype=torch.float64)
+    mixed = torch.rand(5, 3, 4, generator=chance, dtype=torch.float64)
+
+    def parts(weight, normal):
+        factor = torch.einsum("knp,bn->bkp", basis, weight)
+        A = factor.mT @ factor + torch.eye(4, dtype=torch.float64)
+        return A, torch.einsum("nkp,bn,bk->bp", mixed, weight, normal)
+
+    def value(x, weight, normal):
+        A, b = parts(weight, normal)
+        return (x[:, None] @ A @ x[..., None])[:, 0, 0] / 2 - (b * x).sum(-1)
+
+    def optimum(weight, normal):
+        A, b = parts(weight.detach(), normal.detach())
+        return _Optimum.apply(torch.linalg.solve(A, b), weight, normal, value)
+
+    weight, normal = (torch.rand(2, n, generator=chance, dtype=torch.float64, requires_grad=True) for n in (5, 3))
+    assert torch.autograd.gradcheck(optimum, (weight, normal))
 
 
 def test_gradients_through_the_optimum_are_those_of_the_search_begun_again():
