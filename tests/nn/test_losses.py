@@ -303,3 +303,19 @@ def test_gradients_through_the_optimum_to_the_plane():
     found.omega.square().sum().backward()
     assert normal.grad.isfinite().all()
     assert (normal.grad != 0).any()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cpu_and_cuda_agree(dtype):
+    tolerance = {"rtol": 1e-8, "atol": 1e-10} if dtype == torch.float64 else {"rtol": 2e-3, "atol": 2e-4}
+    found: dict[str, list[torch.Tensor]] = {}
+    for device in ("cpu", "cuda"):
+        window = turning(dtype=dtype).to(device, dtype)
+        omega = vector(OMEGA, dtype=dtype).to(device).requires_grad_()
+        flow = (torch.rand(2, 2, 24, 32, generator=torch.Generator().manual_seed(1)).to(device, dtype) - 0.5).requires_grad_()
+        losses = ContrastLoss(CAMERA)(window, omega), FlowContrastLoss(CAMERA)(window, flow)
+        sum(losses).backward()
+        found[device] = [*losses, omega.grad, flow.grad, Compensate(CAMERA)(window).omega]
+    for a, b in zip(found["cpu"], found["cuda"], strict=True):
+        torch.testing.assert_close(a, b.cpu(), **tolerance)
