@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from torchcmax.core.camera import Camera
 from torchcmax.data import Sample, WindowDataset, collate
@@ -65,16 +65,26 @@ UNSEEN = [
 SMALL_SEEN, SMALL_UNSEEN = [Take("shapes", "rotation", 4, 2.0, 0.0, 0.6)], [Take("shapes", "rotation", 102, 2.0, 0.6, 0.9)]
 
 
-def loaders(cache: Path, small: bool) -> tuple[DataLoader[Sample], DataLoader[Sample], Camera]:
-    """Batches of windows to train with, shuffled, and of unseen ones in order; the camera of all.
+class Held(Dataset[Sample]):
+    """Windows that are read once, as so few fit into memory.  Give a DataLoader the WindowDataset itself, and workers, if yours do not."""
 
-    So few windows fit into memory: a list of samples is a dataset too.  For more, give a DataLoader the WindowDataset itself, and workers.
-    """
+    def __init__(self, windows: WindowDataset) -> None:
+        self.samples = [windows[i] for i in range(len(windows))]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, number: int) -> Sample:
+        return self.samples[number]
+
+
+def loaders(cache: Path, small: bool) -> tuple[DataLoader[Sample], DataLoader[Sample], Camera]:
+    """Batches of windows to train with, shuffled, and of unseen ones in order; the camera of all."""
     seen, unseen = ([take.file(cache) for take in takes] for takes in ((SMALL_SEEN, SMALL_UNSEEN) if small else (SEEN, UNSEEN)))
     train, test = WindowDataset(seen, EVENTS, stride=EVENTS // 2), WindowDataset(unseen, EVENTS)
     batch = 8 if small else 32
     return (
-        DataLoader([*train], batch, shuffle=True, drop_last=True, collate_fn=collate),
-        DataLoader([*test], batch, collate_fn=collate),
+        DataLoader(Held(train), batch, shuffle=True, drop_last=True, collate_fn=collate),
+        DataLoader(Held(test), batch, collate_fn=collate),
         train.cameras[0],
     )

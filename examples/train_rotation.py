@@ -8,7 +8,7 @@ Then it meets windows of other textures and motions, against the truth, and agai
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import chain, repeat
 from pathlib import Path
 from time import monotonic
@@ -27,29 +27,52 @@ from torchcmax.nn import Compensate, ContrastLoss
 from torchcmax.nn.image import displacement
 from torchcmax.picture import pictures
 
+BINS, WIDTH = 5, 32
+RIDGE = 1e-3  # information of a cell that sees nothing, so that it stays at rest
+
+
+class Cells(nn.Module):
+    """Windows -> the motion in cells of 8 x 8 px, and how sure it is: information A [B, h, w, 2, 2], and A times the flow [B, h, w, 2, 1].
+
+    An edge shows only the motion across it.  So a cell does not say a flow, but the terms of a least-squares problem, which add up over the
+    cells, whatever the flow is sought for.  Flows are px of the sensor over the window: a window has a number of events, not a duration.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__()
+        self.canvas = Canvas.around(camera, 0.0).scaled(0.5)  # every second pixel is enough; then two strides of 2
+        self.layers = nn.Sequential(
+            nn.Conv2d(BINS, WIDTH, 5, 2, 2), nn.ReLU(), nn.Conv2d(WIDTH, WIDTH, 3, 1, 1), nn.ReLU(),
+            nn.Conv2d(WIDTH, 2 * WIDTH, 3, 2, 1), nn.ReLU(), nn.Conv2d(2 * WIDTH, 2 * WIDTH, 3, 1, 1), nn.ReLU(),
+            nn.Conv2d(2 * WIDTH, 5, 1),
+        )  # fmt: skip
+
+    def forward(self, window: Window, H_k: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        grid = voxel_grid(window, self.canvas, BINS, H_k)
+        grid = grid / (5 * grid.abs().mean((1, 2, 3), keepdim=True)).clamp_min(1e-6)  # as if all had the same number of events a pixel
+        u, v, a, b, c = self.layers(grid).unbind(1)
+        root = torch.stack([a, torch.zeros_like(a), b, c], -1).unflatten(-1, (2, 2))  # so that the information is never negative
+        A = root @ root.mT
+        return A, A @ torch.stack([u, v], -1)[..., None]
+
 
 class TurnNet(nn.Module):
     """Windows -> omega [B, 3] rad/s, in two looks: at the events as they came, and at what motion is left in them.
 
-    Convolutions see local motion, which is the same all over the image; how a turn moves each place is geometry, and need not be learned.
-    So the network tells a flow for each cell, and how sure it is of it in which direction (an edge shows only the motion across it); the
-    turn that fits all cells best is a least-squares problem of three unknowns.  A window has a number of events, not a duration: flows and
-    turns are over the window, and only the result is divided by its seconds.
+    What moves where is seen by convolutions, the same all over the image; how a turn moves each place is geometry, which is not learned.
     """
 
-    def __init__(self, camera: Camera, bins: int = 5, width: int = 32) -> None:
+    J: Tensor  # [h, w, 2, 3] px/rad: how a turn about x, y and z moves each cell
+
+    def __init__(self, camera: Camera) -> None:
         super().__init__()
-        self.canvas, self.bins = Canvas.around(camera, 0.0).scaled(0.5), bins
-        self.layers = nn.Sequential(
-            nn.Conv2d(bins, width, 5, 2, 2), nn.ReLU(), nn.Conv2d(width, width, 3, 1, 1), nn.ReLU(),
-            nn.Conv2d(width, 2 * width, 3, 2, 1), nn.ReLU(), nn.Conv2d(2 * width, 2 * width, 3, 1, 1), nn.ReLU(),
-            nn.Conv2d(2 * width, 5, 1),
-        )  # fmt: skip
-        rows, columns = (torch.arange(-(-n // 4)) * 4.0 for n in self.canvas.size)
-        y, x = torch.meshgrid(rows - self.canvas.centre[1], columns - self.canvas.centre[0], indexing="ij")
-        x, y = x / self.canvas.focal, y / self.canvas.focal
-        flow = [x * y, -1 - x * x, y, 1 + y * y, -x * y, -x]  # of a point on the plane z = 1 by a turn about x, y, z
-        self.register_buffer("flow", torch.stack(flow, -1).view(-1, 2, 3), persistent=False)
+        self.cells = Cells(camera)
+        canvas = self.cells.canvas
+        rows, columns = (torch.arange(-(-n // 4)) * 4.0 for n in canvas.size)  # of the cells' middles on the canvas
+        y, x = torch.meshgrid((rows - canvas.centre[1]) / canvas.focal, (columns - canvas.centre[0]) / canvas.focal, indexing="ij")
+        moved = [x * y, -1 - x * x, y, 1 + y * y, -x * y, -x]  # (u, v) of the point (x, y, 1) by a turn about x, y and z
+        self.focal = 2 * canvas.focal  # px of the sensor
+        self.register_buffer("J", self.focal * torch.stack(moved, -1).unflatten(-1, (2, 3)), persistent=False)
 
     def forward(self, window: Window) -> Tensor:
         first: Tensor = self.look(window, torch.zeros_like(window.ray[:, 0]))
@@ -57,28 +80,25 @@ class TurnNet(nn.Module):
 
     def look(self, window: Window, omega: Tensor) -> Tensor:
         """The turn that is left when the events are compensated by omega: [B, 3] rad/s."""
-        H_k = displacement(window, omega, None, None, 0.5).homography()
-        grid = voxel_grid(window, self.canvas, self.bins, H_k)
-        grid = grid / (5 * grid.abs().mean((1, 2, 3), keepdim=True)).clamp_min(1e-6)  # as if all had the same number of events a pixel
-        u, v, *sure = self.layers(grid).flatten(2).unbind(1)  # each [B, cells]
-        root = torch.stack([sure[0], sure[1], torch.zeros_like(u), sure[2]], -1).unflatten(-1, (2, 2))  # of the information, so it is >= 0
-        J, r = root @ self.flow, root @ torch.stack([u, v], -1)[..., None]
-        A, b = (J.mT @ J).mean(1) + 1e-3 * torch.eye(3, device=J.device), (J.mT @ r).mean(1)
-        turn = torch.linalg.solve(A, b)[..., 0] / (2 * self.canvas.focal)  # cells tell px of the sensor
-        omega: Tensor = turn / window.duration[:, None]
-        return omega
-
-
-def error(omega: Tensor, truth: Tensor) -> Tensor:
-    """Of omega, a share of the true speed: [B]."""
-    return (omega - truth).norm(dim=-1) / truth.norm(dim=-1)
+        A, b = self.cells(window, displacement(window, omega, None, None, 0.5).homography())
+        ridge = RIDGE * self.focal**2 * torch.eye(3, device=A.device)
+        turn = torch.linalg.solve((self.J.mT @ A @ self.J).mean((1, 2)) + ridge, (self.J.mT @ b).mean((1, 2)))[..., 0]
+        left: Tensor = turn / window.duration[:, None]
+        return left
 
 
 def fit(
-    network: TurnNet, train: Iterable[Sample], unseen: list[Sample], camera: Camera, seconds: float, device: str, board: SummaryWriter
+    network: nn.Module,
+    objective: Callable[[Window, float], Tensor],
+    train: Iterable[Sample],
+    camera: Camera,
+    seconds: float,
+    watch: Callable[[], dict[str, float]],
+    board: SummaryWriter,
 ) -> None:
-    """Train for so many seconds; the truth of the unseen windows is looked at for the curve alone."""
-    augment, chance = Augment(camera), torch.Generator(device).manual_seed(torch.initial_seed())
+    """Train for so many seconds.  objective: window, blur in px -> loss | watch: what is shown ten times on the way, of unseen windows."""
+    like = next(network.parameters())
+    augment, chance = Augment(camera), torch.Generator(like.device).manual_seed(torch.initial_seed())
     optimizer = torch.optim.AdamW(network.parameters(), 2e-3)
     begin, shown = monotonic(), 0.0
     for step, sample in enumerate(chain.from_iterable(repeat(train))):
@@ -88,8 +108,7 @@ def fit(
         # Far from the right motion a sharp image does not tell where to go, and a soft one does: begin with much blur.
         blur = max(1.0, 4.0 * 0.25 ** (1.3 * done))
         optimizer.param_groups[0]["lr"] = 2e-3 * min(1.0, (step + 1) / 50) * (1 - done)
-        window = augment(sample.to(device, torch.float32), chance).window
-        loss = ContrastLoss(camera, blur=blur, against="rest")(window, network(window))
+        loss = objective(augment(sample.to(like.device, like.dtype), chance).window, blur)
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -99,9 +118,16 @@ def fit(
         if done >= shown:
             shown += 0.1
             with torch.no_grad():
-                percent = 100 * torch.cat([error(network(s.window), s.omega) for s in unseen]).median().item()
-            board.add_scalar("unseen/error_percent", percent, step)
-            print(f"{done * seconds:4.0f} s, step {step}: loss {loss.item():.3f}, error of unseen windows {percent:.1f} %", flush=True)
+                seen = watch()
+            for name, value in seen.items():
+                board.add_scalar(f"unseen/{name}", value, step)
+            print(f"{done * seconds:4.0f} s, step {step}, loss {loss:.3f}; unseen:", *(f"{n} {v:.3f}" for n, v in seen.items()), flush=True)
+
+
+def error(omega: Tensor, truth: Tensor) -> Tensor:
+    """Of omega, % of the true speed: [B]."""
+    percent: Tensor = 100 * (omega - truth).norm(dim=-1) / truth.norm(dim=-1)
+    return percent
 
 
 @torch.no_grad()
@@ -109,35 +135,29 @@ def compare(network: TurnNet, unseen: list[Sample], camera: Camera, board: Summa
     """The network by itself, and as the start of the optimizer, on windows that it has not seen."""
     sought = Compensate(camera, gradients="detached")
     at_once = Compensate(camera, search=Search((1.0,)), gradients="detached")  # cold too, but without the rounds that are blurred
-    loss = ContrastLoss(camera, against="rest", reduction="none")
-    rows = []
+    loss, canvas, rows = ContrastLoss(camera, against="rest", reduction="none"), Canvas.around(camera), []
     for step, sample in enumerate(unseen):
         window, omega = sample.window, network(sample.window)
         cold, sharp, warm = sought(window), at_once(window), sought(window, start=omega)
         found = [result.estimate for result in (cold, sharp, warm)]
-        numbers = [error(omega, sample.omega), error(cold.omega, sample.omega), loss(window, omega)]
-        rows.append(torch.stack(numbers + [e.evaluations for e in found] + [e.contrast for e in found], 1))
+        told = [error(omega, sample.omega), error(cold.omega, sample.omega), loss(window, omega)]
+        rows.append(torch.stack(told + [e.evaluations for e in found] + [e.contrast for e in found], 1))
         ways = tuple(displacement(window, turn, None, None, 0.5).homography() for turn in (torch.zeros_like(omega), omega, cold.omega))
-        board.add_image(
-            "as they came | network | optimizer", pictures(window, ways, Canvas.around(camera), 0.5)[0], step, dataformats="HWC"
-        )
+        board.add_image("as they came, network, optimizer", pictures(window, ways, canvas, 0.5)[0], step, dataformats="HWC")
     table = torch.cat(rows)
-    middle, mean = table.median(0).values.tolist(), table.mean(0).tolist()
-    results = {
-        "error of the network, median, %": 100 * middle[0],
-        "error of the optimizer, median, %": 100 * middle[1],
-        "loss of the network, at rest 0": mean[2],
+    mean = table.mean(0).tolist()
+    return {
+        "error of the network, median, %": table[:, 0].median().item(),
+        "error of the optimizer, median, %": table[:, 1].median().item(),
+        "loss of the network, 0 at rest": mean[2],
         "evaluations, cold": mean[3],
-        "evaluations, cold, one round": mean[4],
+        "evaluations, cold, in one round": mean[4],
         "evaluations, warm": mean[5],
-        "contrast, cold": mean[6],
-        "contrast, cold, one round": mean[7],
-        "contrast, warm": mean[8],
         "evaluations saved, %": 100 * (1 - mean[5] / mean[3]),
+        "contrast, cold": mean[6],
+        "contrast, cold, in one round": mean[7],
+        "contrast, warm": mean[8],
     }
-    for name, value in results.items():
-        board.add_scalar(f"compare/{name}", value)
-    return results
 
 
 def main(
@@ -162,11 +182,26 @@ def main(
     train, test, camera = loaders(cache, small)
     unseen = [sample.to(device, torch.float32) for sample in test]
     network = TurnNet(camera).to(device)
+
+    def objective(window: Window, blur: float) -> Tensor:
+        loss: Tensor = ContrastLoss(camera, blur=blur, against="rest")(window, network(window))
+        return loss
+
+    def watch() -> dict[str, float]:
+        return {"error_percent": torch.cat([error(network(sample.window), sample.omega) for sample in unseen]).median().item()}
+
     with SummaryWriter(str(out)) as board:
-        fit(network, train, unseen, camera, 60 * minutes, device, board)
-        results = compare(network, unseen, camera, board)
-    torch.save(network.state_dict(), out / "network.pt")  # read it with torch.load(..., weights_only=True)
-    print("\n".join(f"{name:36} {value:8.3f}" for name, value in results.items()) + f"\ncurves: tensorboard --logdir {out}")
+        fit(network, objective, train, camera, 60 * minutes, watch, board)
+        return finish(out, network, compare(network, unseen, camera, board), board)
+
+
+def finish(out: Path, network: nn.Module, results: dict[str, float], board: SummaryWriter) -> dict[str, float]:
+    """Keep the network, to be read with torch.load(..., weights_only=True), and say what came out."""
+    torch.save(network.state_dict(), out / "network.pt")
+    for name, value in results.items():
+        board.add_scalar(f"compare/{name}", value)
+        print(f"{name:44} {value:8.3f}")
+    print(f"network: {out / 'network.pt'}\ncurves: tensorboard --logdir {out}")
     return results
 
 
