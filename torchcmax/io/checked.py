@@ -10,7 +10,7 @@ import numpy as np
 from torchcmax.io.errors import DataError, DataNote, DataWarning, tell
 from torchcmax.io.events import Events
 
-SORT = "sort -s -n -k1,1 events.txt > sorted.txt"
+TEXTS = (".txt", ".csv")
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,20 @@ def _refuse(chunk: Events, before: np.ndarray, seen: int, source: Source) -> Non
     if wrong.any():
         i = int(wrong.argmax())
         how = "at the same time as" if chunk.t[i] == before[i] else "earlier than"
-        remedy = f"leave out --strict, or sort the file: {SORT}"
+        remedy = f"leave out --strict, or {_sorting(source)}"
         raise DataError(source.path, f"event {seen + i + 1} is {how} the one before it", remedy, source.place(seen + i))
+
+
+def _sorting(source: Source) -> str:
+    """How to bring a file in order."""
+    if not source.path.endswith(TEXTS):
+        return "sort it by time with the tool that wrote it, or open it in larger chunks: torchcmax.io.OpenOptions(chunk=...)"
+    name = source.path.rpartition("/")[2]
+    return f"sort the file by the column of its times, where that is the first: sort -s -n -k1,1 {name} > sorted.txt"
 
 
 def _too_late(chunk: Events, handed: int, seen: int, source: Source) -> DataError:
     """The first event that is older than what was already handed on."""
     i = int((chunk.t < handed).argmax())
     problem = f"event {seen + i + 1} at {int(chunk.t[i])} us comes after too many later ones to be sorted, up to {handed} us"
-    return DataError(source.path, problem, f"sort the file first: {SORT}", source.place(seen + i))
+    return DataError(source.path, problem, _sorting(source), source.place(seen + i))
