@@ -1,11 +1,26 @@
-"""A rig as its YAML file describes it.  Lengths m, angles rad, SI throughout; drive units live in objects.py alone."""
+"""A rig as its YAML file describes it.  Lengths m, angles rad, SI throughout; drive units live in objects.py alone.
+
+The keys of the file name their units.  A linear axis is told in m, m/s, m/s², N and kg (max_m, v_mps, a_mps2, coulomb_n, mass_kg), a rotary
+one in degrees, Nm and kg m² (max_deg, v_degps, a_degps2, coulomb_nm, inertia_kgm2).  configs/rig has examples with every key.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import math
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
-from torchcmax.rig.motors import Motor
+import yaml
+
+from torchcmax.rig.errors import Refused
+from torchcmax.rig.motors import Motor, motor
+from torchcmax.rig.section import Section, read
+
+BITRATES = ("10000", "20000", "50000", "125000", "250000", "500000", "800000", "1000000")  # CiA 301
+HOMING = (-4, -3, -2, -1, 1, 2, 7, 11, 17, 18, 23, 27, 33, 34, 35, 37)  # methods of the EPOS drives
+COUNTS = 2**31 - 1  # quadcounts that a drive's position holds
 
 
 @dataclass(frozen=True)
@@ -26,7 +41,10 @@ class Transmission:
 
 @dataclass(frozen=True)
 class Limits:
-    """Of an axis: position m or rad, its derivatives by s, following error, deceleration of a quick stop."""
+    """Of an axis: position m or rad, its derivatives by s, following error, deceleration of a quick stop.
+
+    j: infinite where the file gives none.  Drives run trapezoids, whose jerk no number bounds: with one, no plan is accepted.
+    """
 
     min: float
     max: float
@@ -52,6 +70,8 @@ class Axis:
 
     direction [3] and, of a rotary axis, a point [3] m on it, in the parent's frame | load: kg, kg m² | friction, gravity: N, Nm
     current_peak A | cpt: counts per turn of the motor, 4 quadcounts each | serial: of the drive, None where any will do
+    gravity: what the motor holds against, where it pulls to negative positions; of a rotary axis, the most that it can be
+    mode: which of the drive's modes it may use, profile position, profile velocity or both
     """
 
     name: str
@@ -71,6 +91,7 @@ class Axis:
     gravity: float
     limits: Limits
     homing: Homing
+    mode: Literal["auto", "ppm", "pvm"] = "auto"
 
 
 @dataclass(frozen=True)
@@ -89,7 +110,9 @@ class Bus:
 class Rig:
     """A whole rig.  supply, bus_max V | modulation: share of the supply that a drive gives | bus_capacitance F | ambient °C
 
-    camera: end effector -> camera, base: world -> first axis; x, y, z m and quaternion x, y, z, w | digest: SHA-256 of what was read
+    camera T_ec: end effector -> camera, base T_w0: world -> first axis; x, y, z m and quaternion x, y, z, w | digest: SHA-256 of the file
+    Where the scene moves, base is that of the first axis in the camera's frame, and camera the world's pose on the end effector.
+    rate 1/s: of the record, that of the SYNC or a whole part of it.
     focal px and distance m, where given, tell the image speed.
     """
 
@@ -108,3 +131,207 @@ class Rig:
     focal: float | None
     distance: float | None
     digest: str
+
+
+def load(path: str | Path) -> Rig:
+    """The rig of a YAML file; Refused with the line, what is wrong and what to do."""
+    file = Path(path)
+    top, content = read(file, "rig bus axes camera record")
+    rig = top.section("rig", "name moves supply_v modulation bus_max_v bus_capacitance_f ambient_c")
+    supply = rig.number("supply_v", above=0)
+    bus = _bus(top.section("bus", "interface channel bitrate sync_period_s heartbeat_s heartbeat_timeout_s"))
+    camera = top.section("camera", "T_ec T_w0", "focal_px distance_m")
+    record = top.section("record", "rate_hz")
+    rate = record.number("rate_hz", above=0)
+    part = 1 / (rate * bus.sync_period)
+    if round(part) < 1 or abs(part - round(part)) > 1e-6:
+        raise record.wrong("rate_hz", f"is {rate:g}", f"it wants the rate of the SYNC, {1 / bus.sync_period:g}, or a whole part of it")
+    return Rig(
+        name=rig.text("name"),
+        moves=_literal(rig.choice("moves", "camera", "scene")),
+        supply=supply,
+        modulation=rig.number("modulation", above=0, most=1),
+        bus_max=rig.number("bus_max_v", above=supply),
+        bus_capacitance=rig.number("bus_capacitance_f", above=0),
+        ambient=rig.number("ambient_c", least=-40, most=100),
+        bus=bus,
+        axes=_axes(top),
+        camera=_pose(camera, "T_ec"),
+        base=_pose(camera, "T_w0"),
+        rate=rate,
+        focal=camera.number("focal_px", above=0) if "focal_px" in camera else None,
+        distance=camera.number("distance_m", above=0) if "distance_m" in camera else None,
+        digest=hashlib.sha256(content).hexdigest(),
+    )
+
+
+def _bus(section: Section) -> Bus:
+    period, heartbeat = section.number("sync_period_s", least=1e-3, most=0.1), section.number("heartbeat_s", least=1e-3, most=1)
+    return Bus(
+        interface=section.text("interface"),
+        channel=section.text("channel"),
+        bitrate=int(section.choice("bitrate", *BITRATES)),
+        sync_period=period,
+        heartbeat=heartbeat,
+        heartbeat_timeout=section.number("heartbeat_timeout_s", least=2 * max(heartbeat, period), most=1),
+    )
+
+
+def _axes(top: Section) -> tuple[Axis, ...]:
+    axes: list[Axis] = []
+    nodes = top.items("axes")
+    if not 1 <= len(nodes) <= 3:
+        raise top.wrong("axes", f"holds {len(nodes)}", "a rig has one to three axes")
+    for node in nodes:
+        axis = _axis(top.file, node)
+        for other in axes:
+            if axis.name == other.name or axis.node_id == other.node_id:
+                which = f"name {axis.name}" if axis.name == other.name else f"node_id {axis.node_id}"
+                raise top.refused(f"two axes have the {which}", "give each its own", node)
+        axes.append(axis)
+    return tuple(axes)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """How the keys of an axis are spelled, and what they are multiplied with."""
+
+    place: str
+    rate: str
+    scale: float
+    force: str
+    load: str
+    transmissions: tuple[str, ...]
+    geometry: str  # keys that only this kind has
+    travel: str
+
+
+UNITS = {
+    "linear": Unit("m", "mps", 1.0, "n", "mass_kg", ("belt", "screw"), "", "travel_per_rev_m"),
+    "rotary": Unit("deg", "degps", math.pi / 180, "nm", "inertia_kgm2", ("rotary",), "point_m", ""),
+}
+
+
+def _axis(file: Path, node: yaml.Node) -> Axis:
+    every = "name kind direction drive motor encoder transmission load limits homing"
+    kind = Section(file, "axis", node, every, "point_m").choice("kind", *UNITS)
+    unit = UNITS[kind]
+    section = Section(file, "axis", node, f"{every} {unit.geometry}")
+    drive = section.section("drive", "family node_id mode", "serial")
+    if drive.text("mode") in ("ipm", "csp", "csv", "cst"):
+        raise drive.wrong(
+            "mode", f"is {drive.text('mode')}, but interpolated and cyclic modes are out", "the profile runs in the drive: write auto"
+        )
+    winding = section.section("motor", "part current_peak_a")
+    encoder = section.section("encoder", "cpt invert")
+    load = section.section("load", f"{unit.load} coulomb_{unit.force} gravity_{unit.force}")
+    axis = Axis(
+        name=section.text("name"),
+        kind=_literal(kind),
+        direction=_direction(section),
+        point=_three(section.numbers("point_m", 3)) if "point_m" in section else (0.0, 0.0, 0.0),
+        family=_literal(drive.choice("family", "epos2", "epos4")),
+        node_id=drive.whole("node_id", 1, 127),
+        serial=drive.whole("serial", 0, 2**32 - 1) if "serial" in drive else None,
+        motor=_motor(winding),
+        current_peak=winding.number("current_peak_a", above=0),
+        cpt=encoder.whole("cpt", 1, 2**20),
+        invert=encoder.flag("invert"),
+        transmission=_transmission(section, unit),
+        load=load.number(unit.load, least=0),
+        friction=load.number(f"coulomb_{unit.force}", least=0),
+        gravity=load.number(f"gravity_{unit.force}"),
+        limits=_limits(section, unit),
+        homing=_homing(section, unit),
+        mode=_literal(drive.choice("mode", "auto", "ppm", "pvm")),
+    )
+    _fits(section, axis)
+    return axis
+
+
+def _fits(section: Section, axis: Axis) -> None:
+    """What concerns more than one section of an axis."""
+    limits, home = axis.limits, axis.homing
+    turns = max(abs(limits.min), abs(limits.max)) / axis.transmission.travel * axis.transmission.ratio
+    if not turns * 4 * axis.cpt < COUNTS:
+        raise section.wrong("limits", "reach beyond what the drive can count", f"at most {COUNTS} quadcounts from zero")
+    if not limits.min <= home.offset <= limits.max:
+        raise section.wrong("homing", "puts home outside of the limits", "offset is where the axis stands after homing")
+    if home.speed > limits.v:
+        raise section.wrong("homing", "is faster than the axis may be", "lower its speed")
+
+
+def _transmission(axis: Section, unit: Unit) -> Transmission:
+    keys = f"type ratio efficiency {unit.travel} backlash_{unit.place} input_speed_max_rpm"
+    section = axis.section("transmission", keys, "inertia_kgm2")
+    return Transmission(
+        kind=_literal(section.choice("type", *unit.transmissions)),
+        ratio=section.number("ratio", above=0),
+        efficiency=section.number("efficiency", above=0, most=1),
+        travel=section.number(unit.travel, above=0) if unit.travel else 2 * math.pi,
+        backlash=section.number(f"backlash_{unit.place}", least=0) * unit.scale,
+        inertia=section.number("inertia_kgm2", least=0) if "inertia_kgm2" in section else 0.0,
+        max_input_speed=section.number("input_speed_max_rpm", above=0) * math.pi / 30,
+    )
+
+
+def _limits(axis: Section, unit: Unit) -> Limits:
+    jerk = f"j_{unit.rate}3"
+    keys = f"min_{unit.place} max_{unit.place} v_{unit.rate} a_{unit.rate}2 following_{unit.place} quick_stop_{unit.rate}2"
+    section = axis.section("limits", keys, jerk)
+    lowest = section.number(f"min_{unit.place}")
+    return Limits(
+        min=lowest * unit.scale,
+        max=section.number(f"max_{unit.place}", above=lowest) * unit.scale,
+        v=section.number(f"v_{unit.rate}", above=0) * unit.scale,
+        a=section.number(f"a_{unit.rate}2", above=0) * unit.scale,
+        j=section.number(jerk, above=0) * unit.scale if jerk in section else math.inf,
+        following=section.number(f"following_{unit.place}", above=0) * unit.scale,
+        quick_stop=section.number(f"quick_stop_{unit.rate}2", above=0) * unit.scale,
+    )
+
+
+def _homing(axis: Section, unit: Unit) -> Homing:
+    section = axis.section("homing", f"method speed_{unit.rate} offset_{unit.place}")
+    method = section.whole("method", min(HOMING), max(HOMING))
+    if method not in HOMING:
+        raise section.wrong("method", f"is {method}", f"the drives know {', '.join(map(str, HOMING))}")
+    speed = section.number(f"speed_{unit.rate}", above=0) * unit.scale
+    return Homing(method, speed, section.number(f"offset_{unit.place}") * unit.scale)
+
+
+def _motor(section: Section) -> Motor:
+    try:
+        return motor(section.text("part"))
+    except Refused as error:
+        raise section.wrong("part", "is unknown", str(error)) from error
+
+
+def _direction(section: Section) -> tuple[float, float, float]:
+    """Of unit length."""
+    x, y, z = section.numbers("direction", 3)
+    length = math.hypot(x, y, z)
+    if not length > 1e-9:
+        raise section.wrong("direction", "has no length", "it is a vector in the parent's frame, like [1, 0, 0]")
+    return x / length, y / length, z / length
+
+
+def _pose(section: Section, key: str) -> tuple[float, ...]:
+    """x y z qx qy qz qw, the quaternion of length 1."""
+    values = section.numbers(key, 7)
+    length = math.hypot(*values[3:])
+    if abs(length - 1) > 1e-3:
+        raise section.wrong(
+            key, f"has a quaternion of length {length:.4g}", "it is x y z qx qy qz qw, the quaternion of length 1 with qw last"
+        )
+    return (*values[:3], *(value / length for value in values[3:]))
+
+
+def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z
+
+
+def _literal(word: str) -> Any:
+    """A word that was chosen from those of its type."""
+    return word
