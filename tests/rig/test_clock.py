@@ -47,9 +47,9 @@ def texture(rng, rms):
 
 
 def rates(rng, driven, offset, drift=FAST, rms=0.25, bin_width=0.005):
-    """Poisson events, 300,000 at 1 m/s and 20,000 of noise a second, counted in bins of the camera's clock that begin anywhere."""
+    """Poisson events, 600,000 at 1 m/s and 40,000 of noise a second, as the simulator's, counted in bins that begin anywhere."""
     gain, grid = texture(rng, rms), np.arange(-1.0, driven.time[-1] + 1.0, 1e-4)
-    expected = 2e4 + 3e5 * np.interp(grid, driven.time, np.abs(driven.velocity[:, 0]) * gain(driven.place), left=0, right=0)
+    expected = 4e4 + 6e5 * np.interp(grid, driven.time, np.abs(driven.velocity[:, 0]) * gain(driven.place), left=0, right=0)
     camera = offset + (1 + drift) * np.append(grid, grid[-1] + 1e-4)
     edges = np.arange(camera[0] + rng.uniform(0, bin_width), camera[-1], bin_width)
     events = rng.poisson(np.diff(np.interp(edges, camera, np.append(0, expected.cumsum()) * 1e-4)))

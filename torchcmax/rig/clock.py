@@ -18,6 +18,9 @@ PROMINENCE = 0.05  # of a peak of the correlation that counts as another offset
 NEAR, FINE = 0.025, 0.0025  # s: about the best of the grid, where the offset is looked for first, and how finely
 KNOTS = 40  # of the gain along the path: how much texture there is to see
 AGAIN = 1.9  # times the range of places that the path is long, at least, for gain and speed to be told apart
+WAYS = np.array([0.003, 0.01, 0.03, 0.1])  # of the range: after turning round, events come again as 1 - exp(-way / one of these)
+FAR = 1e9  # m: of no turning
+STEADY = 0.1  # of the fastest: windows in which the drives are slower at either end are left out, as most of their events are of one end
 BLOCKS = 5  # of the run, each left out once
 CLEAR, FASTEST, SURE = 0.3, 200e-6, 1e-3  # peak to side at least; drift and sigma, s, at most
 WIDEST, KNOWN = 500e-6, 20e-6  # drift that is looked for, and the sigma below which it is told
@@ -49,7 +52,8 @@ class Seen:
 class ClockModel:
     """t_camera = offset + (1 + drift) t_drive.
 
-    offset s | sigma: its standard deviation at mid-run, s, of chance alone: an event camera's lag, 0.3 to 1 ms, is within the offset
+    offset s | sigma: its standard deviation at mid-run, s, of chance alone: how late the camera reports, by velocity some 0.3 ms, by rate
+    the time of a pixel, is within the offset
     drift_sigma: where it is above 20 ppm, drift is not told and 0 | peak_to_side: by which share other offsets correlate less
     reason: why it is not accepted, empty where it is
     """
@@ -88,8 +92,11 @@ def align(driven: Driven, seen: Seen, method: Method) -> ClockModel:
         return _unknown(method, "the camera saw the opposite motion: look at camera, moves and direction in the configuration")
     if max(block.sum() for block in blocks) > len(seen.start) - 10 * BLOCKS / 2:
         return _unknown(method, "the camera saw a small part of the run only: record it all")
+    if method == "velocity":
+        fit = fit.only(fit.steady(fit.best(first, 0.0)[0]))
+        blocks = fit.blocks(first)
     shift, drift, chance = fit.best(first, WIDEST)
-    parts = np.array([fit.without(block).best(shift, WIDEST)[:2] for block in blocks])
+    parts = np.array([fit.only(~block).best(shift, WIDEST)[:2] for block in blocks])
     spread = np.sqrt((BLOCKS - 1) * parts.var(0))  # delete-a-group jackknife, Shao and Tu 1995, 2.3
     sigma, drift_sigma = np.maximum(spread, chance)
     if drift_sigma > KNOWN:
@@ -170,6 +177,16 @@ def _first(driven: Driven, seen: Seen, method: Method) -> tuple[float, float]:
     return float(offset), float(1 - side / max(score[best], 1e-9))
 
 
+def _since_turning(place: np.ndarray) -> np.ndarray:
+    """Way since the last change of direction: [K] -> [K], without end before the first.  A rest changes nothing."""
+    step = np.diff(place, prepend=place[0])
+    way, moving = np.abs(step).cumsum(), np.flatnonzero(step)
+    turns = moving[1:][np.sign(step[moving[1:]]) != np.sign(step[moving[:-1]])]
+    last = np.searchsorted(turns, np.arange(len(place)), side="right")
+    since: np.ndarray = way - np.append(-FAR, way[turns - 1])[last]
+    return since
+
+
 class _Fit:
     """Least squares of shift and drift, t_camera = shift + t_drive + drift (t_drive - middle), with the gain for each solved."""
 
@@ -179,9 +196,19 @@ class _Fit:
         moving = driven.time[speed > 0.01 * speed.max()]
         self.middle = float(moving[0] + moving[-1]) / 2
         self.knots = np.linspace(driven.place.min(), driven.place.max(), KNOTS)
+        self.turned = _since_turning(driven.place)
 
-    def without(self, block: np.ndarray) -> _Fit:
-        return _Fit(self.driven, self.seen[~block], self.method)
+    def only(self, keep: np.ndarray) -> _Fit:
+        return _Fit(self.driven, self.seen[keep], self.method)
+
+    def steady(self, shift: float) -> np.ndarray:
+        """Windows in which the drives neither rest nor turn round: [W] bool."""
+        t0, t1 = self.seen.start - shift, self.seen.end - shift
+        speed = np.linalg.norm(self.driven.velocity, axis=1)
+        slowest = np.minimum(*(np.interp(t, self.driven.time, speed) for t in (t0, t1)))
+        way = np.interp(t1, self.driven.time, self.driven.place) - np.interp(t0, self.driven.time, self.driven.place)
+        keep: np.ndarray = (slowest > STEADY * speed.max()) & (np.interp(t1, self.driven.time, self.turned) > np.abs(way))
+        return keep
 
     def best(self, near: float, widest: float) -> tuple[float, float, np.ndarray]:
         """Shift, drift, and the standard deviations [2] that the residuals would let expect."""
@@ -206,7 +233,9 @@ class _Fit:
         else:
             place = np.interp((t0 + t1) / 2, self.driven.time, self.driven.place)
             hats = (1 - np.abs(place[:, None] - self.knots) / (self.knots[1] - self.knots[0])).clip(0)
-            design = np.concatenate([mean * hats, np.ones_like(mean)], 1)
+            turned = np.interp((t0 + t1) / 2, self.driven.time, self.turned)[:, None]
+            again = np.exp(-turned / (WAYS * (self.knots[-1] - self.knots[0])))
+            design = np.concatenate([mean * hats, mean * again, np.ones_like(mean)], 1)
         value = self.seen.value.reshape(-1)
         if self.method == "rate":  # as counts scatter, by their root
             weight = np.maximum(value / np.quantile(value, 0.9), 0.1) ** -0.5
