@@ -1,0 +1,104 @@
+"""Ground truth of a run: poses and velocities of the camera from the drives' encoders."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+
+from torchcmax.rig.axis import Chain, quantum
+from torchcmax.rig.clock import ClockModel
+from torchcmax.rig.config import Axis, Rig
+from torchcmax.rig.errors import Refused
+
+TRUTH, BY_DRIVES, TWIST, SAID = "groundtruth.txt", "groundtruth_driveclock.txt", "twist.txt", "truth.json"
+SAMPLES, ORDER = 21, 3  # of the filter that velocities are read from
+ENDED = "complete"  # the status of a run that ended normally
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """What the encoders told.  time [K] s of the drives' clock, at even steps | place [K, A] m, rad | status: how the run ended"""
+
+    time: np.ndarray
+    place: np.ndarray
+    status: str
+    simulated: bool
+    repeatability: dict[str, float] | None = None
+
+
+def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | None) -> dict[str, Any]:
+    """Poses, velocities and what is known of them into the folder -> what truth.json says.
+
+    groundtruth.txt, in the camera's clock, only where that clock is accepted and the run ended normally; an older one goes away.
+    """
+    if len(encoded.time) < SAMPLES:
+        raise Refused(f"{folder}: {len(encoded.time)} samples of the encoders are too few for velocities, wanted are {SAMPLES}")
+    known = clock is not None and clock.accepted and encoded.status == ENDED
+    head = f"# configuration {rig.digest}{', simulated' if encoded.simulated else ''}; "
+    (folder / TRUTH).unlink(missing_ok=True)  # while it is written anew, there is none
+    poses = Chain(rig).pose(encoded.place)
+    _write(folder / BY_DRIVES, _poses(head + "the drives' clock", encoded.time, poses))
+    time, clock_name = (
+        (clock.camera(encoded.time), "the camera's clock") if clock is not None and known else (encoded.time, "the drives' clock")
+    )
+    _write(folder / TWIST, _twists(head + clock_name, rig, time, encoded))
+    said: dict[str, Any] = {
+        "status": encoded.status,
+        "simulated": encoded.simulated,
+        "configuration": rig.digest,
+        "truth": known,
+        "sigma_x": {axis.name: sigma(axis) for axis in rig.axes},
+        "sigma_t": clock.sigma if clock is not None and known else None,
+        "clock": None if clock is None else told(clock),
+        "repeatability": encoded.repeatability,
+    }
+    _write(folder / SAID, json.dumps(said, indent=2) + "\n")
+    if known:
+        _write(folder / TRUTH, _poses(head + clock_name, time, poses))
+    return said
+
+
+def sigma(axis: Axis) -> float:
+    """Standard deviation of a position, m or rad: rounding to the encoder's quantum, and the whole backlash."""
+    return math.hypot(quantum(axis) / math.sqrt(12), axis.transmission.backlash)
+
+
+def told(clock: ClockModel) -> dict[str, Any]:
+    """A clock model as JSON: what is not known is null."""
+    values = asdict(clock) | {"accepted": clock.accepted}
+    return {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()}
+
+
+def _poses(head: str, time: np.ndarray, poses: np.ndarray) -> str:
+    """Poses T_wc [K, 4, 4] as TUM."""
+    rows = np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], 1)
+    return _lines(f"{head}; t tx ty tz qx qy qz qw, camera to world, s and m", time, rows, ".12f")
+
+
+def _twists(head: str, rig: Rig, time: np.ndarray, encoded: Encoded) -> str:
+    """Velocities in the camera's frame, from a cubic through samples around each; the ends, which lack some, are left out."""
+    step = (encoded.time[-1] - encoded.time[0]) / (len(encoded.time) - 1)
+    place, rate = (savgol_filter(encoded.place, SAMPLES, ORDER, deriv, step, axis=0) for deriv in (0, 1))
+    inner = slice(SAMPLES // 2, -(SAMPLES // 2))
+    rows = np.concatenate(Chain(rig).twist(place[inner], rate[inner]), 1)
+    return _lines(f"{head}; t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s", time[inner], rows, ".9g")
+
+
+def _lines(head: str, time: np.ndarray, rows: np.ndarray, form: str) -> str:
+    lines = [" ".join([f"{t:.6f}", *(format(v, form) for v in row)]) for t, row in zip(time.tolist(), rows.tolist(), strict=True)]
+    return "\n".join([head, *lines]) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    """The file appears when it is whole."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
