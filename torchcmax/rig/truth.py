@@ -49,7 +49,9 @@ def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | No
     time, clock_name = (
         (clock.camera(encoded.time), "the camera's clock") if clock is not None and known else (encoded.time, "the drives' clock")
     )
-    _write(folder / TWIST, _twists(head + clock_name, rig, time, encoded))
+    inner, v, omega = motion(rig, encoded)
+    columns = "t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s"
+    _write(folder / TWIST, _lines(f"{head}{clock_name}; {columns}", time[inner], np.concatenate([v, omega], 1), ".9g"))
     said: dict[str, Any] = {
         "status": encoded.status,
         "simulated": encoded.simulated,
@@ -83,13 +85,24 @@ def _poses(head: str, time: np.ndarray, poses: np.ndarray) -> str:
     return _lines(f"{head}; t tx ty tz qx qy qz qw, camera to world, s and m", time, rows, ".12f")
 
 
-def _twists(head: str, rig: Rig, time: np.ndarray, encoded: Encoded) -> str:
-    """Velocities in the camera's frame, from a cubic through samples around each; the ends, which lack some, are left out."""
+def motion(rig: Rig, encoded: Encoded) -> tuple[slice, np.ndarray, np.ndarray]:
+    """Velocities in the camera's frame, from a cubic through the samples around each: which samples, v m/s and omega rad/s [M, 3].
+
+    The ends, which lack samples on one side, are left out.
+    """
     step = (encoded.time[-1] - encoded.time[0]) / (len(encoded.time) - 1)
     place, rate = (savgol_filter(encoded.place, SAMPLES, ORDER, deriv, step, axis=0) for deriv in (0, 1))
     inner = slice(SAMPLES // 2, -(SAMPLES // 2))
-    rows = np.concatenate(Chain(rig).twist(place[inner], rate[inner]), 1)
-    return _lines(f"{head}; t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s", time[inner], rows, ".9g")
+    return inner, *Chain(rig).twist(place[inner], rate[inner])
+
+
+def repeatability(rig: Rig, encoded: Encoded, cycles: int) -> dict[str, float] | None:
+    """Of each axis, m or rad: the largest standard deviation, over the cycles, of where it was at the same time; None of a single one."""
+    samples = len(encoded.time) // max(cycles, 1)
+    if cycles < 2 or samples < 1:
+        return None
+    again = encoded.place[: cycles * samples].reshape(cycles, samples, -1)
+    return {axis.name: float(spread) for axis, spread in zip(rig.axes, again.std(0, ddof=1).max(0), strict=True)}
 
 
 def _lines(head: str, time: np.ndarray, rows: np.ndarray, form: str) -> str:
