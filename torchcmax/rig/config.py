@@ -180,7 +180,7 @@ def _bus(section: Section) -> Bus:
 def _axes(top: Section) -> tuple[Axis, ...]:
     axes: list[Axis] = []
     nodes = top.items("axes")
-    if not 1 <= len(nodes) <= 3:
+    if len(nodes) > 3:
         raise top.wrong("axes", f"holds {len(nodes)}", "a rig has one to three axes")
     for node in nodes:
         axis = _axis(top.file, node)

@@ -53,10 +53,10 @@ class Section:
         return Section(self.file, key, self.entries[key], required, optional)
 
     def items(self, key: str) -> list[yaml.Node]:
-        """The nodes of a list."""
+        """The nodes of a list, at least one."""
         node = self.entries[key]
-        if not isinstance(node, yaml.SequenceNode):
-            raise self.wrong(key, "is no list", f"write {key}: [ ... ]")
+        if not isinstance(node, yaml.SequenceNode) or not node.value:
+            raise self.wrong(key, "is no list of anything", f"write {key}: [ ... ]")
         return list(node.value)
 
     def number(self, key: str, *, above: float = -LARGEST, least: float = -LARGEST, most: float = LARGEST) -> float:

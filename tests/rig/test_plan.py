@@ -1,0 +1,255 @@
+"""Plans: each limit alone refuses, and what is accepted keeps all of them wherever one looks."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from torchcmax.rig.errors import Refused
+from torchcmax.rig.plan import REST, plan
+from torchcmax.rig.profiles import Dwell, Move, Sequence, constant_pass, cruise, sync
+from torchcmax.rig.thermal import TwoBody
+
+LEVER = 0.060 / (2 * math.pi * 4.8)  # m of the slider per rad of its motor
+PASS = [{0: constant_pass(0.12, 0.55, 1.0, 10.0, settle=0.05)}]
+
+
+def of(found, name):
+    """The check whose name begins so, of the first axis that has it."""
+    return next(check for check in found.checks if check.name.startswith(name))
+
+
+def changed(rig, part="", **values):
+    """The rig with another value of its first axis: of its motor, limits, ..., or of itself."""
+    axis = rig.axes[0]
+    axis = replace(axis, **{part: replace(getattr(axis, part), **values)} if part else values)
+    return replace(rig, axes=(axis, *rig.axes[1:]))
+
+
+def test_a_pass_by_hand(slider):
+    """2 kg at 10 m/s² with 3 N of friction, at 1 m/s: 4800 rpm."""
+    found = plan(slider, PASS)
+    assert found.ok
+    found.refuse()
+    torque = 23 * LEVER / 0.85 + 21.9e-7 * 10 / LEVER
+    amperes = torque / 24.3e-3 + 0.191 * 4800 / 9340
+    assert of(found, "current").value == pytest.approx(amperes)
+    hot = 1.27 * (1 + 0.0039 * (found.samples.temperature.max() - 25))
+    assert of(found, "voltage").value == pytest.approx(hot * amperes + 24.3e-3 * 4800 * math.pi / 30)
+    assert of(found, "motor's speed").value == pytest.approx(4800)
+    assert of(found, "encoder").value == pytest.approx(80 * 2000)
+    assert of(found, "upper").value == pytest.approx(0.55 + 0.05 + 1 / 24 + 0.1, abs=1e-5)  # where it begins to brake
+    assert of(found, "upper").time == pytest.approx(0.1 + 0.53, abs=1e-4)
+    assert found.image_speed == pytest.approx(335 * 1.0 / 0.8)
+    assert found.program.begin[0] == pytest.approx(0.02, abs=1e-5)
+
+
+def test_brake_energy(slider):
+    """The specification's run of a simulated drive (H16): such a pass returns 0.67 J, which is 29 V on 4.7 mF and 44 V on 1 mF."""
+    assert of(plan(slider, PASS), "supply's voltage in braking").value == pytest.approx(29.3, abs=0.2)
+    small = replace(slider, bus_capacitance=1e-3)
+    assert of(plan(small, PASS), "supply's voltage in braking").value == pytest.approx(44, abs=0.5)
+
+
+def test_load_of_the_bus(slider):
+    """Frames of 0, 5 and 8 bytes have 55, 105 and 135 bits at most (Davis et al. 2007); heartbeats, of one byte, have 65."""
+    bits = (55 + 105 + 135 + 135) * 1000 + 2 * 65 * 50
+    assert of(plan(slider, PASS), "load").value == pytest.approx(100 * bits / 1e6)
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "field", "share"),
+    [
+        ("lower soft limit", "limits", "min", 1.01),
+        ("upper soft limit", "limits", "max", 0.999),
+        ("speed", "limits", "v", 0.999),
+        ("acceleration", "limits", "a", 0.999),
+        ("motor's speed", "motor", "max_speed", 0.999),
+        ("transmission's input speed", "transmission", "max_input_speed", 0.999),
+        ("current", "", "current_peak", 0.999),
+        ("mean current", "motor", "nominal_current", 0.999),
+        ("mean torque", "motor", "nominal_torque", 0.999),
+    ],
+)
+def test_each_limit_of_an_axis_alone(slider, name, part, field, share):
+    value = of(plan(slider, PASS), name).value * (math.pi / 30 if field in ("max_speed", "max_input_speed") else 1)
+    assert of(plan(changed(slider, part, **{field: value}), PASS), name).margin == pytest.approx(0, abs=1e-9)
+    fails(plan(changed(slider, part, **{field: value / share if field == "min" and value < 0 else value * share}), PASS), name)
+
+
+def fails(found, *names):
+    """Exactly these checks, and the message names them."""
+    failed = [check for check in found.checks if not check.ok]
+    assert len(failed) == len(names)
+    assert all(check.name.startswith(name) and check.margin < 0 for check, name in zip(failed, names, strict=True))
+    with pytest.raises(Refused, match=names[0]):
+        found.refuse()
+
+
+def test_each_limit_of_the_rest_alone(slider):
+    good = plan(slider, PASS)
+    fails(plan(changed(slider, "limits", j=400.0), PASS), "jerk")
+    fails(plan(changed(slider, mode="pvm"), PASS), "moves that the drive's mode does not run")
+    fails(plan(changed(slider, cpt=3200), PASS), "encoder")
+    fails(plan(replace(slider, modulation=of(good, "voltage").value / 24 * 0.999), PASS), "voltage")
+    fails(plan(changed(slider, "limits", quick_stop=40.0), PASS), "current of a quick stop")
+    fails(plan(changed(slider, "motor", winding_max=float(good.samples.temperature.max()) + 9.99), PASS), "winding")
+    fails(plan(replace(slider, bus_max=of(good, "supply's voltage in braking").value - 0.01), PASS), "supply's voltage in braking")
+    fails(plan(replace(slider, bus=replace(slider.bus, bitrate=500000)), PASS), "load of the CAN bus")
+    fails(plan(slider, PASS, cycles=2), "way left to the begin")
+    gentle = [{0: Move(0.0, 0.6, 1.0, 2.0)}]
+    most = of(plan(slider, gentle), "supply's voltage in a quick stop").value
+    fails(plan(replace(slider, bus_max=most - 0.01), gentle), "supply's voltage in a quick stop")
+
+
+def test_an_s_curve_is_refused_with_its_reason(slider):
+    fails(plan(slider, [{0: Move(0.1, 0.5, 0.5, 5.0, 400.0)}]), "moves that the drive's mode does not run")
+
+
+def test_a_cruise_wants_the_velocity_mode(slider):
+    steps = [{0: cruise(0.1, 0.2, 2.0, 1.0)}]
+    found = plan(slider, steps)
+    assert found.ok
+    start, stop = found.program.moves
+    assert (start.kind, start.v, stop.v) == ("velocity", pytest.approx(0.2, rel=1e-3), 0.0)
+    assert stop.start == pytest.approx(1.1, abs=2e-3)
+    state = found.tracks[0].sample([start.v / start.a, stop.start, stop.start + start.v / stop.a])
+    np.testing.assert_allclose(state.v, [start.v, start.v, 0], atol=1e-9)
+    np.testing.assert_allclose(state.x[1] - state.x[0], start.v * (stop.start - start.v / start.a))
+    fails(plan(changed(slider, mode="ppm"), steps), "moves that the drive's mode does not run")
+
+
+def test_a_profile_without_motion_is_refused(slider):
+    with pytest.raises(Refused, match="moves nothing"):
+        plan(slider, [{0: Dwell(0.1, 1.0)}])
+
+
+def test_an_axis_that_is_told_to_creep_is_refused(slider):
+    with pytest.raises(Refused, match="less than 1 rpm"):
+        plan(slider, [{0: Move(0.1, 0.5, 1e-5, 5.0)}])
+
+
+def test_starts_lie_on_the_sync_and_drives_are_told_whole_numbers(pantilt):
+    pan = Sequence((Move(0.0, 0.5, 2.03, 30.1), Dwell(0.5, 0.1234567), Move(0.5, 0.0, 1.11, 17.0)))
+    found = plan(pantilt, [{0: pan, 1: Move(0.0, 0.3, 1.0, 11.0)}, {1: Move(0.1, 0.2, 1.0, 9.0)}])
+    moves = found.program.moves
+    assert [move.axis for move in moves] == [0, 1, 0, 1, 1]  # the fourth brings tilt to where its step begins
+    assert moves[0].start == moves[1].start == 0.0
+    for move in moves:
+        axis = pantilt.axes[move.axis]
+        turn = axis.transmission.ratio / (2 * math.pi)  # of the motor, per rad
+        for whole in (move.start / 0.002, move.v * turn * 60, move.a * turn * 60, move.target * turn * 2000):
+            assert whole == pytest.approx(round(whole), abs=1e-6)
+    for k in (0, 1):
+        own = [move for move in moves if move.axis == k]
+        end = trapezoids(found.program, k, pantilt.bus.sync_period)[1, -1]
+        assert end == pytest.approx(own[-1].target, abs=1e-9)
+    second = Move(0.0, 0.5, moves[0].v, moves[0].a).duration + 0.1234567
+    assert second <= moves[2].start < second + 0.01
+    assert moves[4].start - (moves[3].start + Move(0.3, 0.1, moves[3].v, moves[3].a).duration) >= REST - 1e-9
+
+
+def trapezoids(program, axis, step):
+    """Where an axis is if its drive runs the positions it is told, by steps: t, x, v, a.  Independent of the planner's own sampling."""
+    x, rested, parts = program.begin[axis], 0.0, []
+
+    def rest(until):
+        t = np.arange(rested, until, step)
+        parts.append((t, 0 * t + x, 0 * t, 0 * t))
+
+    for move in (move for move in program.moves if move.axis == axis):
+        assert move.kind == "position"
+        assert rested <= move.start + 1e-9, "it begins before the one before it has ended"
+        rest(move.start)
+        length, way = abs(move.target - x), math.copysign(1, move.target - x)
+        top = min(move.v, math.sqrt(move.a * length))
+        ramp, lasts = top / move.a, length / top + top / move.a
+        corners = [ramp * (1 - 1e-12), ramp, lasts - ramp, lasts * (1 - 1e-12), lasts]
+        s = np.unique(np.append(np.arange(0, lasts, step), corners))
+        gone = np.where(
+            s < ramp, move.a * s**2 / 2, np.where(s < lasts - ramp, top * (s - ramp / 2), length - move.a * (lasts - s) ** 2 / 2)
+        )
+        speed = np.minimum(np.minimum(move.a * s, top), move.a * (lasts - s))
+        a = np.where(s < ramp, move.a, np.where((s < lasts - ramp) | (s == lasts), 0.0, -move.a))
+        parts.append((move.start + s, x + way * gone, way * speed, way * a))
+        x, rested = move.target, move.start + lasts
+    rest(program.duration)
+    return np.concatenate([np.stack(part) for part in parts], 1)
+
+
+SPEED, ACCELERATION, WHERE = st.floats(0.1, 1.5), st.floats(1.0, 13.0), st.floats(0.0, 0.7)
+STEPS = st.lists(st.builds(Move, WHERE, WHERE, SPEED, ACCELERATION), min_size=1, max_size=3)
+
+
+@settings(deadline=None, max_examples=60)
+@given(moves=STEPS, mass=st.floats(0.5, 3.0), gravity=st.floats(-10, 10))
+def test_no_accepted_plan_exceeds_a_limit_anywhere(slider, moves, mass, gravity):
+    rig = changed(slider, load=mass, gravity=gravity)
+    assume(any(abs(move.end - move.begin) > 1e-3 for move in moves))
+    found = plan(rig, [{0: move} for move in moves])
+    _, x, v, a = trapezoids(found.program, 0, 2e-4)
+    way = np.where(v != 0, np.sign(v), np.sign(a))
+    force = mass * a + 3.0 * way + gravity
+    torque = force * LEVER * 0.85 ** -np.where(force * way >= 0, 1, -1) + 21.9e-7 * a / LEVER
+    amperes = torque / 24.3e-3 + 0.191 * v / LEVER / (9340 * math.pi / 30)
+    volts = 1.27 * amperes * (1 + 0.0039 * (found.samples.temperature.max() - 25)) + 24.3e-3 * v / LEVER
+    stop = np.sign(v) * (v**2 / 24 + 0.1 * abs(v))
+    worst = {
+        "lower": (-(x + stop).min(), 0.02),
+        "upper": ((x + stop).max(), 0.75),
+        "speed": (abs(v).max(), 1.4),
+        "acceleration": (abs(a).max(), 12.0),
+        "voltage": (abs(volts).max(), 21.6),
+        "current": (abs(amperes).max(), 5.0),
+        "motor's speed": (abs(v).max() / LEVER * 30 / math.pi, 8000),
+    }
+    if found.ok:
+        assert all(value <= limit * (1 + 1e-9) + 1e-9 for value, limit in worst.values()), worst
+    for name, (value, _) in worst.items():  # and what the plan tells is the worst
+        told = of(found, name).value
+        assert (-told if name == "lower" else told) == pytest.approx(value, rel=1e-6, abs=1e-6), name
+
+
+@settings(deadline=None, max_examples=30)
+@given(a=st.floats(1.0, 12.0), v=st.floats(0.2, 1.4), quick_stop=st.floats(5.0, 30.0))
+def test_the_farthest_quick_stop_is_found(slider, a, v, quick_stop):
+    """Also where it is told in the midst of braking."""
+    found = plan(changed(slider, "limits", quick_stop=quick_stop), [{0: Move(0.0, 0.6, v, a)}])
+    _, x, v, _ = trapezoids(found.program, 0, 1e-4)
+    farthest = (x + v**2 / (2 * quick_stop) + 0.1 * v).max()
+    assert farthest - 1e-9 <= of(found, "upper").value <= farthest + 2e-4
+
+
+def test_cycles_heat_as_if_each_were_run(slider):
+    steps = [{0: sync(0.2, 0.4, 1.0, 10.0, REST)}]
+    once, often = plan(slider, steps), plan(slider, steps, cycles=12)
+    body, speed = TwoBody(slider.axes[0].motor, 25.0), once.samples.v[:-1, 0] / LEVER
+    winding, _ = body.run(np.tile(once.samples.current[:-1, 0], 12), np.tile(speed, 12), 1e-3)
+    np.testing.assert_allclose(often.samples.temperature[1:, 0], winding[-len(speed) :], atol=1e-9)
+    assert often.samples.temperature.max() > once.samples.temperature.max() + 0.5
+
+
+def test_a_motor_that_runs_away_is_refused_and_told_in_json(slider):
+    hungry = changed(slider, load=20.0, current_peak=100.0)
+    found = plan(hungry, [{0: sync(0.2, 0.3, 1.0, 10.0, REST)}], cycles=10**5)
+    assert not of(found, "winding").ok
+    json.dumps(found.summary(), allow_nan=False)
+
+
+def test_gravity_of_a_rotary_axis_may_act_either_way(pantilt):
+    steps = [{1: Move(0.0, 0.5, 2.0, 20.0)}]
+    other = replace(pantilt, axes=(pantilt.axes[0], replace(pantilt.axes[1], gravity=-pantilt.axes[1].gravity)))
+    np.testing.assert_array_equal(*(abs(plan(rig, steps).samples.torque) for rig in (pantilt, other)))
+
+
+def test_the_summary_is_json_and_tells_the_program(slider):
+    found = plan(slider, PASS)
+    read = json.loads(json.dumps(found.summary(), allow_nan=False))
+    assert read["ok"] is True
+    assert read["configuration"] == slider.digest
+    assert read["program"]["moves"][0]["kind"] == "position"
+    assert {"name", "axis", "value", "limit", "unit", "margin", "time", "ok"} == set(read["checks"][0])
