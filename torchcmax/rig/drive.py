@@ -1,0 +1,200 @@
+"""One drive as the host sees it: its dictionary by SDO, its commands and what it tells by PDO.
+
+The CiA 402 state machine is walked here and in runner.py, one controlword at a time: canopen's own profile sends controlwords that nobody
+asked for (with a mode; after a reset), and swallows what goes wrong.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import canopen
+
+from torchcmax.rig import objects as o
+from torchcmax.rig.axis import from_quadcounts, quadcounts
+from torchcmax.rig.config import Axis
+from torchcmax.rig.errors import DriveFault, LinkLost, Refused, RigError
+from torchcmax.rig.objects import FAMILIES, Object, Pdo, State
+from torchcmax.rig.program import Move
+
+
+class Told(NamedTuple):
+    """What a drive told with a SYNC, in its units: quadcounts, rpm, mA."""
+
+    statusword: int = 0
+    mode: int = 0
+    error: int = 0
+    position: int = 0
+    velocity: int = 0
+    current: int = 0
+    following: int = 0
+
+
+class Drive:
+    """The drive of an axis on a network.  heard: which of its PDOs came since the last SYNC; broken: what went wrong while they came."""
+
+    def __init__(self, network: canopen.Network, axis: Axis) -> None:
+        self.axis, self.family, self.network = axis, FAMILIES[axis.family], network
+        self.node = canopen.RemoteNode(axis.node_id, canopen.ObjectDictionary())
+        network.add_node(self.node)
+        self.pdos = o.pdos(axis.family)
+        self.told, self.heard = Told(), set[int]()
+        self.broken: Exception | None = None
+        self.missed = 0  # SYNCs that it has not answered, one after the other
+        self._parts: dict[int, tuple[int, ...]] = {}
+        for pdo in self.pdos:
+            if pdo.send:
+                network.subscribe(pdo.base + axis.node_id, self._on_pdo)
+
+    def __str__(self) -> str:
+        return f"axis {self.axis.name} (node {self.axis.node_id})"
+
+    # -- what it tells
+
+    def _on_pdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """In the thread that receives: may not raise, as canopen would only log that."""
+        try:
+            pdo = next(pdo for pdo in self.pdos if pdo.send and pdo.base + self.axis.node_id == can_id)
+            self._parts[pdo.number] = pdo.unpack(bytes(data))
+            self.heard.add(pdo.number)
+            if len(self.heard) == 3:
+                self.told = Told(*self._parts[1], *self._parts[2], *self._parts[3])
+        except Exception as error:
+            self.broken = error
+
+    @property
+    def complete(self) -> bool:
+        """Whether it answered the last SYNC."""
+        return len(self.heard) == 3
+
+    @property
+    def state(self) -> State | None:
+        return o.state_of(self.told.statusword)
+
+    def shows(self, bit: int) -> bool:
+        return bool(self.told.statusword & bit)
+
+    @property
+    def place(self) -> float:
+        """m or rad."""
+        return float(from_quadcounts(self.axis, self.told.position))
+
+    @property
+    def speed(self) -> float:
+        """m/s or rad/s."""
+        return o.from_rpm(self.axis, self.told.velocity)
+
+    # -- its dictionary
+
+    def read(self, obj: Object) -> int:
+        """By SDO; Refused where the drive refuses, LinkLost where it does not answer."""
+        try:
+            return obj.unpack(self.node.sdo.upload(obj.index, obj.sub))
+        except Exception as error:
+            raise self._failed(f"{obj} cannot be read", error) from error
+
+    def write(self, obj: Object, value: int) -> None:
+        """By SDO; errors as of `read`."""
+        try:
+            self.node.sdo.download(obj.index, obj.sub, obj.pack(value))
+        except Exception as error:
+            raise self._failed(f"{obj} cannot be set to {value}", error) from error
+
+    def _failed(self, what: str, error: Exception) -> RigError:
+        if isinstance(error, canopen.SdoAbortedError):
+            return Refused(f"{self}: {what}: {error}\n  what to do: compare family and firmware with the configuration")
+        remedy = "look at power, cable, termination, bit rate and node id"
+        return LinkLost(f"{self}: {what}: {str(error) or type(error).__name__}\n  what to do: {remedy}")
+
+    def identity(self) -> dict[str, int]:
+        """Vendor, product, serial number, modes."""
+        told = {"vendor": o.VENDOR_ID, "product": o.PRODUCT, "serial": o.SERIAL, "modes": o.SUPPORTED}
+        return {name: self.read(obj) for name, obj in told.items()}
+
+    def identify(self, modes: set[int]) -> dict[str, int]:
+        """Its identity; Refused where it is another drive than the configuration says, or cannot do a mode, or counts other units.
+
+        A drive of another family than configured lacks objects that `configure` writes, and is refused there.
+        """
+        found = self.identity()
+        serial = self.axis.serial
+        wrong = None
+        if found["vendor"] != o.VENDOR:
+            wrong = f"its vendor is 0x{found['vendor']:X}, not maxon's 0x{o.VENDOR:X}"
+        elif serial is not None and found["serial"] != serial:
+            wrong = f"its serial number is {found['serial']}, not {serial}"
+        elif any(not found["modes"] >> (mode - 1) & 1 for mode in modes):
+            missing = [o.MODES[mode] for mode in sorted(modes) if not found["modes"] >> (mode - 1) & 1]
+            wrong = f"it has no mode {', '.join(missing)}, but {', '.join(o.bits(found['modes'])) or 'none that is known'}"
+        elif self.axis.family == "epos4" and (unit := self.read(o.VELOCITY_UNIT)) != o.RPM_UNIT:
+            wrong = f"its unit of velocity is 0x{unit:08X}, not rpm (0x{o.RPM_UNIT:08X})"
+        if wrong is not None:
+            raise Refused(f"{self}: {wrong}\n  what to do: correct node_id, family or serial in the configuration, or the drive's set-up")
+        return found
+
+    def history(self) -> list[int]:
+        """Codes of its last errors, latest first."""
+        return [self.read(Object(0x1003, sub, "u32")) & 0xFFFF for sub in range(1, self.read(o.ERROR_COUNT) + 1)]
+
+    def configure(self, timeout: float) -> dict[str, int]:
+        """Write limits, supervision and the PDO mapping, and read all of it back; Refused where anything differs."""
+        wanted = o.settings(self.axis, timeout)
+        for obj, value in wanted.items():
+            self.write(obj, value)
+        for pdo in self.pdos:
+            wanted |= self._map(pdo)
+        for obj, value in wanted.items():
+            if (found := self.read(obj)) != value:
+                remedy = "look whether the drive's firmware knows the value, or a parameter lock is on"
+                raise Refused(f"{self}: {obj} was set to {value} and reads {found}\n  what to do: {remedy}")
+        return {str(obj): value for obj, value in wanted.items()}
+
+    def _map(self, pdo: Pdo) -> dict[Object, int]:
+        """Write a PDO's mapping, as CiA 301 wants it: off, emptied, filled, on -> what must then be read."""
+        cob_id, kind = Object(pdo.communication, 1, "u32"), Object(pdo.communication, 2, "u8")
+        count = Object(pdo.mapping, 0, "u8")
+        here = pdo.base + self.axis.node_id
+        entries = {
+            Object(pdo.mapping, sub, "u32"): entry.index << 16 | entry.sub << 8 | entry.size * 8 for sub, entry in enumerate(pdo.entries, 1)
+        }
+        self.write(cob_id, here | o.OFF)
+        self.write(kind, pdo.transmission)
+        self.write(count, 0)
+        for obj, value in entries.items():
+            self.write(obj, value)
+        self.write(count, len(entries))
+        self.write(cob_id, here)
+        return {cob_id: here, kind: pdo.transmission, count: len(entries), **entries}
+
+    # -- its commands, which it takes with the next SYNC
+
+    def control(self, word: int) -> None:
+        """A controlword."""
+        self._send(1, word)
+
+    def aim(self, move: Move) -> None:
+        """The set point of a move, which starts with a controlword, or at the next SYNC where it is one of velocity."""
+        axis = self.axis
+        v, a = o.rpm(axis, move.v), abs(o.rpm(axis, move.a))
+        self._send(3, a, a)
+        if move.kind == "position":
+            self._send(2, int(quadcounts(axis, move.target)), abs(v))
+        else:
+            self.turn(o.PROFILE_VELOCITY_MODE, v)
+
+    def turn(self, mode: int, rpm: int = 0) -> None:
+        """A mode, and the velocity that profile velocity mode is to have."""
+        self._send(4, mode, rpm)
+
+    def _send(self, number: int, *values: int) -> None:
+        pdo = next(pdo for pdo in self.pdos if not pdo.send and pdo.number == number)
+        self.network.send_message(pdo.base + self.axis.node_id, pdo.pack(*values))
+
+    def check(self) -> None:
+        """DriveFault where it is in a fault state."""
+        if self.broken is not None:
+            raise self.broken
+        if self.state in (State.FAULT, State.FAULTING):
+            axis = self.axis
+            where = f"at {self.place:.4f} {'m' if axis.kind == 'linear' else 'rad'}, {self.told.following} quadcounts behind its demand"
+            raise DriveFault(f"{self}: {o.error_text(self.told.error)}, {where}\n  what to do: remove the cause; then --reset-fault")
