@@ -101,6 +101,8 @@ def align(driven: Driven, seen: Seen, method: Method) -> ClockModel:
     sigma, drift_sigma = np.maximum(spread, chance)
     if drift_sigma > KNOWN:
         shift, drift, _ = fit.best(first, 0.0)
+    if method == "rate":  # what depends on how a sensor is thought to turn round is not known
+        sigma = max(sigma, abs(_Fit(driven, seen, method, WAYS[:0]).best(first, 0.0)[0] - shift))
     often = np.abs(np.diff(driven.place)).sum() / np.ptp(driven.place)
     reason = _reason(clear, drift, sigma, often if method == "rate" else np.inf)
     return ClockModel(float(shift - drift * fit.middle), float(drift), float(sigma), float(drift_sigma), method, clear, reason)
@@ -190,8 +192,8 @@ def _since_turning(place: np.ndarray) -> np.ndarray:
 class _Fit:
     """Least squares of shift and drift, t_camera = shift + t_drive + drift (t_drive - middle), with the gain for each solved."""
 
-    def __init__(self, driven: Driven, seen: Seen, method: Method) -> None:
-        self.driven, self.seen, self.method, self.path = driven, seen, method, _path(driven, method)
+    def __init__(self, driven: Driven, seen: Seen, method: Method, ways: np.ndarray = WAYS) -> None:
+        self.driven, self.seen, self.method, self.path, self.ways = driven, seen, method, _path(driven, method), ways
         speed = np.linalg.norm(driven.velocity, axis=1)
         moving = driven.time[speed > 0.01 * speed.max()]
         self.middle = float(moving[0] + moving[-1]) / 2
@@ -234,7 +236,7 @@ class _Fit:
             place = np.interp((t0 + t1) / 2, self.driven.time, self.driven.place)
             hats = (1 - np.abs(place[:, None] - self.knots) / (self.knots[1] - self.knots[0])).clip(0)
             turned = np.interp((t0 + t1) / 2, self.driven.time, self.turned)[:, None]
-            again = np.exp(-turned / (WAYS * (self.knots[-1] - self.knots[0])))
+            again = np.exp(-turned / (self.ways * (self.knots[-1] - self.knots[0])))
             design = np.concatenate([mean * hats, mean * again, np.ones_like(mean)], 1)
         value = self.seen.value.reshape(-1)
         if self.method == "rate":  # as counts scatter, by their root
