@@ -181,7 +181,7 @@ def _since(path: Path, layout: Layout | None, time: int, chunk: int) -> tuple[in
 
 def _piece_before(path: Path, file: Any, time: int) -> int:
     """First event of the last stored piece that begins before a time, µs; 0 where none does."""
-    count, stored, remedy = len(file["events/t"]), (file["events/t"].chunks or (1,))[0], "convert the recording again"
+    count, stored, remedy = len(file["events/t"]), (file["events/t"].chunks or (STORED,))[0], "convert the recording again"
     index = numbers(path, file, "index", remedy, MANY)
     if index.ndim != 1 or len(index) != -(-count // stored) or (index[1:] < index[:-1]).any():
         raise DataError(path, f"its index of {index.size} times does not fit its {count} events", remedy)
