@@ -115,7 +115,7 @@ class Session:
                 raise LinkLost(f"{drive}: has not answered {drive.missed} SYNCs\n  what to do: look at its power and cable")
             if not self.stopping:
                 drive.check()
-        if self.limited:
+        if self.limited and not self.stopping:
             self._limit()
         if self.k % self.beat == 0:
             self.network.send_message(HEARTBEAT + o.MASTER, bytes([OPERATIONAL]))
@@ -252,6 +252,13 @@ class Session:
         far = max(abs(d.place - x) / d.axis.homing.speed for d, x in zip(self.drives, places, strict=True))
         self.follow(Program(tuple(moves), places, far + 1.0))
 
+    def ready(self, program: Program) -> None:
+        """The drives in the modes that their first moves want."""
+        firsts = {move.axis: move for move in sorted(program.moves, key=lambda move: -move.start)}
+        for move in firsts.values():
+            self._turn(move)
+        self.rest(TURN * self.period)
+
     def follow(self, program: Program) -> None:
         """The moves of a program, each at its SYNC, until all axes have arrived."""
         first, pending = self.k + 1, sorted(program.moves, key=lambda move: move.start)
@@ -328,8 +335,7 @@ class Session:
             if error is not None:
                 for drive in moving:
                     drive.control(o.QUICK)
-                limits = [drive.axis.limits for drive in moving]
-                self._while(lambda: not all(abs(drive.told.velocity) <= STANDS for drive in self.drives), self._patience(limits))
+                self._while(lambda: not all(abs(drive.told.velocity) <= STANDS for drive in self.drives), self._patience())
             for word in (o.SHUT_DOWN, o.NO_VOLTAGE) if error is None else (o.NO_VOLTAGE,):
                 for drive in moving:
                     drive.control(word)
@@ -342,8 +348,9 @@ class Session:
             if error is None:
                 raise
 
-    def _patience(self, limits: list[Any]) -> float:
-        return 0.5 + max((2 * limit.v / limit.quick_stop for limit in limits), default=0.0)
+    def _patience(self) -> float:
+        """s that stopping may take."""
+        return 0.5 + max(2 * drive.axis.limits.v / drive.axis.limits.quick_stop for drive in self.drives)
 
     def _while(self, going: Callable[[], bool], seconds: float) -> None:
         """Tick while something is so, for so long at most, or until the user presses again."""
@@ -406,6 +413,7 @@ def run(
         session.enable(dict.fromkeys(range(len(rig.axes)), o.PROFILE_POSITION))
         session.go(program.begin)
         session.rest(DWELL)
+        session.ready(program)
         session.begin, session.recording = session.k + 1, True
         for _ in range(repeat):
             begin = session.k + 1 - session.begin
@@ -413,6 +421,7 @@ def run(
             said["cycles"].append([begin, session.k - session.begin])
             if len(said["cycles"]) < repeat:
                 session.go(program.begin)
+                session.ready(program)
         session.rest(DWELL)
 
     return _session(rig, out, simulate, modes | ({o.HOMING} if simulate else set()), reset, watch, network, work)

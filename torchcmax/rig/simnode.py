@@ -128,6 +128,7 @@ def _defaults(family: str) -> dict[Object, int]:
         o.MODE: 1, o.QUICK_STOP: 10000, o.ACCELERATION: 10000, o.DECELERATION: 10000, o.PROFILE_VELOCITY: 1000,
         o.MAX_PROFILE_VELOCITY: 50000, o.HOMING_METHOD: 7, o.HOMING_SPEED: 100, o.HOMING_SLOWLY: 10, o.HOMING_ACCELERATION: 1000,
     }  # fmt: skip
+    defaults |= {Object(0x1003, sub, "u32"): 0 for sub in range(1, HISTORY + 1)}
     for number in range(1, PDOS + 1):
         for base, kind, mapped in ((0x1400, 0x1600, [o.CONTROLWORD]), (0x1800, 0x1A00, [o.STATUSWORD])):
             where, what = base + number - 1, kind + number - 1
@@ -164,6 +165,8 @@ class SimulatedDrive:
         self.network = network
         self._by_place = {(obj.index, obj.sub): obj for obj in self.family.objects}
         self.received: dict[int, tuple[int, list[Object]]] = {}
+        network.unsubscribe(self.node.sdo.rx_cobid)
+        network.subscribe(self.node.sdo.rx_cobid, self._on_sdo)
         network.subscribe(SYNC, self._on_sync)
         network.subscribe(HEARTBEAT + o.MASTER, self._on_heartbeat)
         network.subscribe(0, self._on_nmt)
@@ -182,12 +185,12 @@ class SimulatedDrive:
 
     def _written(self, index: int, subindex: int, od: Any, data: bytes) -> None:
         obj = self._by_place.get((index, subindex))
-        if self.faults.dropped:
-            raise RuntimeError("nobody is there")
         if obj in self.faults.aborted:
             raise canopen.SdoAbortedError(self.faults.aborted[obj])
         if obj == o.MODE:
             self._take_mode(o.MODE.unpack(data))
+        elif obj == o.CONTROLWORD:
+            self._control(o.CONTROLWORD.unpack(data))
 
     def _take_mode(self, mode: int) -> None:
         """Unless it is refused, or there already."""
@@ -249,7 +252,12 @@ class SimulatedDrive:
     # -- the bus
 
     def _on_heartbeat(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        self.heard = self.time
+        if not self.faults.dropped:
+            self.heard = self.time
+
+    def _on_sdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        if not self.faults.dropped:
+            self.node.sdo.on_request(can_id, data, timestamp)
 
     def _on_nmt(self, can_id: int, data: bytearray, timestamp: float) -> None:
         if data[1] in (0, self.number) and data[0] == 1:
@@ -455,8 +463,9 @@ class Simulation:
 
 @contextmanager
 def simulated(rig: Rig, places: tuple[float, ...] | None = None, faults: dict[str, Faults] | None = None) -> Iterator[Simulation]:
-    """The drives of a rig, switched on; by default in the middle of their ways."""
-    made = Simulation(rig, places or tuple((axis.limits.min + axis.limits.max) / 2 for axis in rig.axes), faults)
+    """The drives of a rig, switched on; by default a tenth of their ways from home, so that it is soon found."""
+    away = tuple(axis.homing.offset + (axis.limits.max - axis.homing.offset) / 10 for axis in rig.axes)
+    made = Simulation(rig, places or away, faults)
     try:
         yield made
     finally:
