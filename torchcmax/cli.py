@@ -10,13 +10,13 @@ from typing import Any
 import torch
 
 from torchcmax import __version__
-from torchcmax.commands import batch, compensate, convert, evaluate, info, panorama, report, simulate, track
+from torchcmax.commands import batch, compensate, convert, evaluate, info, panorama, report, rig, simulate, track
 from torchcmax.config import USAGE_ERROR, Parser, UsageError, parser
 from torchcmax.io import DataError, DataNote, DataWarning
 
 COMMANDS = {
     "simulate": simulate, "info": info, "convert": convert, "compensate": compensate, "track": track, "panorama": panorama, "batch": batch,
-    "evaluate": evaluate, "report": report,
+    "evaluate": evaluate, "report": report, "rig": rig,
 }  # fmt: skip
 KEEPING = ("compensate", "track", "panorama", "batch")  # commands that leave what was finished when they are stopped
 DATA_ERROR, INTERRUPTED = 1, 130
@@ -29,8 +29,10 @@ def build() -> Parser:
     main = parser("torchcmax", DESCRIPTION)
     main.add_argument("--version", action="version", version=__version__)
     commands = main.add_subcommands(required=True, dest="command")
+    parsers = {name: module.build() for name, module in COMMANDS.items()}
     for name, module in COMMANDS.items():
-        commands.add_subcommand(name, module.build(), help=module.SUMMARY)
+        commands.add_subcommand(name, parsers[name], help=module.SUMMARY)
+    rig.add_actions(parsers["rig"])  # inner commands come after all outer ones
     return main
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torchcmax.rig.axis import Chain, quantum
 from torchcmax.rig.clock import ClockModel
 from torchcmax.rig.config import Axis, Rig
 from torchcmax.rig.errors import Refused
+from torchcmax.rig.record import write_whole
 
 TRUTH, BY_DRIVES, TWIST, SAID = "groundtruth.txt", "groundtruth_driveclock.txt", "twist.txt", "truth.json"
 SAMPLES, ORDER = 21, 3  # of the filter that velocities are read from
@@ -31,7 +32,7 @@ class Encoded:
     place: np.ndarray
     status: str
     simulated: bool
-    repeatability: dict[str, float] | None = None
+    repeatability: dict[str, float] | None = None  # as of `repeatability`
 
 
 def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | None) -> dict[str, Any]:
@@ -45,13 +46,13 @@ def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | No
     head = f"# configuration {rig.digest}{', simulated' if encoded.simulated else ''}; "
     (folder / TRUTH).unlink(missing_ok=True)  # while it is written anew, there is none
     poses = Chain(rig).pose(encoded.place)
-    _write(folder / BY_DRIVES, _poses(head + "the drives' clock", encoded.time, poses))
+    write_whole(folder / BY_DRIVES, _poses(head + "the drives' clock", encoded.time, poses))
     time, clock_name = (
         (clock.camera(encoded.time), "the camera's clock") if clock is not None and known else (encoded.time, "the drives' clock")
     )
     inner, v, omega = motion(rig, encoded)
     columns = "t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s"
-    _write(folder / TWIST, _lines(f"{head}{clock_name}; {columns}", time[inner], np.concatenate([v, omega], 1), ".9g"))
+    write_whole(folder / TWIST, _lines(f"{head}{clock_name}; {columns}", time[inner], np.concatenate([v, omega], 1), ".9g"))
     said: dict[str, Any] = {
         "status": encoded.status,
         "simulated": encoded.simulated,
@@ -62,9 +63,9 @@ def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | No
         "clock": None if clock is None else told(clock),
         "repeatability": encoded.repeatability,
     }
-    _write(folder / SAID, json.dumps(said, indent=2) + "\n")
+    write_whole(folder / SAID, json.dumps(said, indent=2) + "\n")
     if known:
-        _write(folder / TRUTH, _poses(head + clock_name, time, poses))
+        write_whole(folder / TRUTH, _poses(head + clock_name, time, poses))
     return said
 
 
@@ -96,22 +97,19 @@ def motion(rig: Rig, encoded: Encoded) -> tuple[slice, np.ndarray, np.ndarray]:
     return inner, *Chain(rig).twist(place[inner], rate[inner])
 
 
-def repeatability(rig: Rig, encoded: Encoded, cycles: int) -> dict[str, float] | None:
-    """Of each axis, m or rad: the largest standard deviation, over the cycles, of where it was at the same time; None of a single one."""
-    samples = len(encoded.time) // max(cycles, 1)
-    if cycles < 2 or samples < 1:
+def repeatability(rig: Rig, encoded: Encoded, cycles: Sequence[Sequence[int]]) -> dict[str, float] | None:
+    """Of each axis, m or rad: the largest standard deviation, over the cycles, of where it was at the same time; None of a single one.
+
+    cycles: first and last SYNC of each
+    """
+    rows = [np.searchsorted(encoded.time, np.array(cycle) * rig.bus.sync_period - 1e-9) for cycle in cycles]
+    length = min((last - first for first, last in rows), default=0)
+    if len(rows) < 2 or length < 1:
         return None
-    again = encoded.place[: cycles * samples].reshape(cycles, samples, -1)
+    again = np.stack([encoded.place[first : first + length] for first, _ in rows])
     return {axis.name: float(spread) for axis, spread in zip(rig.axes, again.std(0, ddof=1).max(0), strict=True)}
 
 
 def _lines(head: str, time: np.ndarray, rows: np.ndarray, form: str) -> str:
     lines = [" ".join([f"{t:.6f}", *(format(v, form) for v in row)]) for t, row in zip(time.tolist(), rows.tolist(), strict=True)]
     return "\n".join([head, *lines]) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    """The file appears when it is whole."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)

@@ -1,0 +1,271 @@
+"""torchcmax rig: a motor rig that moves the camera or the scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jsonargparse import Namespace
+from tqdm import tqdm
+
+from torchcmax.commands import rigtruth
+from torchcmax.commands.arguments import folder
+from torchcmax.config import Parser, UsageError
+
+if TYPE_CHECKING:  # the extra may be missing
+    from torchcmax.rig.config import Rig
+    from torchcmax.rig.plan import Plan
+
+SUMMARY = "move a motor rig, and make ground truth from its encoders"
+EXTRA = ("can", "canopen", "scipy", "matplotlib")
+EMERGENCY = "a hardware emergency stop within reach is your duty; nothing that this program does is a safety function"
+DESCRIPTION = (
+    "Move a motor rig (slider, rotary stage, pan-tilt; maxon EPOS4 and EPOS2 drives on CANopen) and make ground truth from its encoders: "
+    "plan, check, home, run, sync, truth. Try it without hardware: run --dry-run. Mind: "
+    f"{EMERGENCY}. docs/rig.md leads from a new rig to its first run. Exits 0: done, 2: configuration or plan refused, 3: a drive's fault, "
+    "4: communication lost, 5: stopped by the user, 6: clocks not aligned."
+)
+ARM_HELP = f"let hardware move: {EMERGENCY}"
+
+
+def build() -> Parser:
+    """Without its actions."""
+    return Parser(description=DESCRIPTION)
+
+
+def add_actions(parser: Parser) -> None:
+    """Each a command of its own."""
+    commands = parser.add_subcommands(required=True, dest="action")
+    for name, (options, _, help) in ACTIONS.items():
+        sub = Parser(description=f"{help[0].upper()}{help[1:]}.")
+        options(sub)
+        commands.add_subcommand(name, sub, help=help)
+
+
+def run(config: Namespace) -> int:
+    """torchcmax rig"""
+    try:
+        from torchcmax.rig.errors import RigError
+
+        try:
+            ACTIONS[config.action][1](config[config.action])
+        except RigError as error:
+            print(f"torchcmax rig {config.action}: {error}", file=sys.stderr)
+            return error.code
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRA:
+            raise
+        raise UsageError(f"{error.name} is not installed; what to do: pip install 'torchcmax[rig]'") from error
+    return 0
+
+
+def _rig_options(sub: Parser) -> None:
+    sub.add_argument("rig", type=str, help="YAML file of the rig, like configs/rig/slider.yaml")
+
+
+def _profile_options(sub: Parser) -> None:
+    _rig_options(sub)
+    sub.add_argument("profile", type=str, help="YAML file of the motion, like configs/rig/slider_pass.yaml")
+    sub.add_argument("--repeat", type=int, default=1, help="how many times")
+
+
+def _bus_options(sub: Parser) -> None:
+    sub.add_argument("--dry-run", action="store_true", help="simulated drives and motors, on a bus within this process")
+    sub.add_argument("--interface", type=str, default="", help="of python-can, like socketcan, instead of what the rig's file says")
+    sub.add_argument("--channel", type=str, default="", help="like can0, instead of what the rig's file says")
+
+
+def _moving_options(sub: Parser) -> None:
+    _bus_options(sub)
+    sub.add_argument("--arm", action="store_true", help=ARM_HELP)
+    sub.add_argument("--reset-fault", action="store_true", help="reset a drive that is in its fault state, once; it stays switched off")
+    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _motors_options(sub: Parser) -> None:
+    sub.add_argument("--verify", action="store_true", help="check the identities between the printed numbers")
+
+
+def _plan_options(sub: Parser) -> None:
+    _profile_options(sub)
+    sub.add_argument("-o", "--out", type=str, default="", help="folder for plan.json and pictures; default: only print")
+
+
+def _run_options(sub: Parser) -> None:
+    _profile_options(sub)
+    _moving_options(sub)
+    sub.add_argument("-o", "--out", type=str, required=True, help="folder to write")
+
+
+def _home_options(sub: Parser) -> None:
+    _rig_options(sub)
+    _moving_options(sub)
+    sub.add_argument("-o", "--out", type=str, default="home", help="folder for the log")
+
+
+def _check_options(sub: Parser) -> None:
+    _rig_options(sub)
+    _bus_options(sub)
+
+
+def _record_options(sub: Parser) -> None:
+    _check_options(sub)
+    sub.add_argument("--duration", type=float, default=60.0, help="s")
+    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+    sub.add_argument("-o", "--out", type=str, required=True, help="folder to write")
+
+
+def _motors(config: Namespace) -> None:
+    from torchcmax.rig.motors import UNITS, motors, verify
+
+    shown = "voltage no_load_speed nominal_speed nominal_torque nominal_current resistance torque_constant max_speed".split()
+    heads = [UNITS[name][0] for name in shown]
+    print("  ".join(["part  ", *heads, "motor"]))
+    for motor in motors().values():
+        numbers = [f"{getattr(motor, name) / UNITS[name][1]:>{len(head)}.4g}" for name, head in zip(shown, heads, strict=True)]
+        print("  ".join([motor.part, *numbers, motor.family]))
+    for motor in motors().values() if config.verify else ():
+        for found in verify(motor):
+            column, unit = UNITS[found.field]
+            verdict = "OUTSIDE OF ROUNDING" if found.outside_rounding else "within rounding"
+            numbers = [f"printed {found.printed / unit:.4g}, computed {found.computed / unit:.4g}, {100 * found.relative:+.2f} %"]
+            print(f"{motor.part}  {column} = {found.identity}: {numbers[0]}, {verdict}")
+
+
+def _plan(config: Namespace) -> None:
+    plan = _planned(config)
+    print(_table(plan))
+    if config.out:
+        _write_plan(folder(config.out), config, plan)
+    plan.refuse()
+
+
+def _run(config: Namespace) -> None:
+    from torchcmax.rig.runner import run
+
+    plan, out = _planned(config), folder(config.out)
+    plan.refuse()
+    _armed(config)
+    _write_plan(out, config, plan)
+    with _watched(config, plan.program.duration * config.repeat, plan.rig) as watch, rigtruth.kept(out, plan.rig):
+        told = {"simulate": config.dry_run, "arm": config.arm, "repeat": config.repeat, "reset": config.reset_fault}
+        run(plan.rig, plan.program, out, watch=watch, **told)
+    print(f"run: {out}, {'simulated' if config.dry_run else plan.rig.name}; the clock is next: torchcmax rig sync {out} --help")
+
+
+def _home(config: Namespace) -> None:
+    from torchcmax.rig.runner import home
+
+    rig, out = _rig(config), folder(config.out)
+    with _watched(config, 0.0, rig) as watch:
+        home(rig, out, simulate=config.dry_run, arm=config.arm, reset=config.reset_fault, watch=watch)
+    print(f"home is known; log: {out / 'log.jsonl'}")
+
+
+def _check(config: Namespace) -> None:
+    from torchcmax.rig.runner import check
+
+    print(json.dumps(check(_rig(config), simulate=config.dry_run), indent=2))
+
+
+def _record(config: Namespace) -> None:
+    from torchcmax.rig.runner import watch_encoders
+
+    if not 0 < config.duration < 86_400:
+        raise UsageError(f"--duration wants seconds above 0, got {config.duration}")
+    rig, out = _rig(config), folder(config.out)
+    _begin(out, config)
+    with _watched(config, config.duration, rig) as watch, rigtruth.kept(out, rig):
+        watch_encoders(rig, out, config.duration, simulate=config.dry_run, watch=watch)
+    print(f"record: {out / 'encoder.csv'}")
+
+
+def _armed(config: Namespace) -> None:
+    """Nothing of an older run goes away for one that may not begin."""
+    from torchcmax.rig.errors import Refused
+
+    if not (config.dry_run or config.arm):
+        raise Refused(f"this would move hardware, and is not armed\n  what to do: try --dry-run, or give --arm; {EMERGENCY}")
+
+
+def _rig(config: Namespace) -> Rig:
+    """As its file has it, and the options that stand above it."""
+    from torchcmax.rig.config import load
+
+    rig = load(config.rig)
+    other = {name: config[name] for name in ("interface", "channel") if config.get(name)}
+    return dataclasses.replace(rig, bus=dataclasses.replace(rig.bus, **other))
+
+
+def _planned(config: Namespace) -> Plan:
+    from torchcmax.rig.plan import plan
+    from torchcmax.rig.profilefile import load_profile
+
+    if not 1 <= config.repeat <= 10_000:
+        raise UsageError(f"--repeat wants a number from 1 to 10000, got {config.repeat}")
+    rig = _rig(config)
+    return plan(rig, load_profile(config.profile, rig), config.repeat)
+
+
+def _table(plan: Plan) -> str:
+    """Every check in a line."""
+    lines = [f"{'':8} {'check':40} {'worst':>10} {'limit':>10} {'':8} {'margin':>10} {'at s':>8}"]
+    for check in plan.checks:
+        numbers = f"{check.value:10.4g} {check.limit:10.4g} {check.unit:8} {check.margin:10.4g} {check.time:8.3f}"
+        lines.append(f"{check.axis or 'rig':8} {check.name:40} {numbers}  {'' if check.ok else 'NOT KEPT'}".rstrip())
+    lines.append(f"{len(plan.program.moves)} moves in {plan.program.duration:.3f} s; {plan.cycles} times")
+    if plan.image_speed is not None:
+        lines.append(f"the image moves at up to {plan.image_speed:.0f} px/s")
+    return "\n".join(lines)
+
+
+def _write_plan(out: Path, config: Namespace, plan: Plan) -> None:
+    """plan.json, and what it was made of."""
+    from torchcmax.rig.record import write_whole
+
+    _begin(out, config)
+    shutil.copyfile(config.profile, out / "profile.yaml")
+    write_whole(out / "plan.json", json.dumps(plan.summary(), indent=2) + "\n")
+
+
+def _begin(out: Path, config: Namespace) -> None:
+    """A folder with the rig's file, and without what an older run left there of clocks."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in rigtruth.OF_CLOCKS:
+        (out / name).unlink(missing_ok=True)
+    shutil.copyfile(config.rig, out / rigtruth.LOCK)
+
+
+@contextmanager
+def _watched(config: Namespace, seconds: float, rig: Rig) -> Iterator[Callable[[int], None]]:
+    """A progress bar in seconds of the drives' clock, which is told the SYNCs; and what nobody may forget."""
+    if config.get("arm") and not config.dry_run:
+        print(f"mind: {EMERGENCY}", file=sys.stderr)
+    layout = "{l_bar}{bar}| {n:.1f}/{total:.1f} s [{elapsed}]"
+    with tqdm(total=seconds, desc=rig.name, disable=config.quiet, bar_format=layout) as bar:
+
+        def watch(k: int) -> None:
+            if k % 100 == 0:
+                done = k * rig.bus.sync_period
+                bar.total = max(seconds, done)  # homing, and the way to where it begins, come before
+                bar.update(done - bar.n)
+
+        yield watch
+
+
+ACTIONS: dict[str, tuple[Callable[[Parser], None], Callable[[Namespace], None], str]] = {
+    "motors": (_motors_options, _motors, "show the motors whose data sheets are known, and how far these agree with themselves"),
+    "plan": (_plan_options, _plan, "check a motion against every limit, and say what motors and supply need for it; no hardware"),
+    "run": (_run_options, _run, "run a planned motion and record the encoders"),
+    "home": (_home_options, _home, "find home on every axis"),
+    "check": (_check_options, _check, "say who is on the bus and how it is set up; writes nothing to the drives"),
+    "record": (_record_options, _record, "record the encoders of a rig that is moved by hand, its drives switched off"),
+    "sync": (rigtruth.sync_options, rigtruth.sync, "find the camera's clock, by the velocity that it saw or the rate of its events"),
+    "truth": (rigtruth.truth_options, rigtruth.truth, "write ground truth in the camera's clock"),
+}

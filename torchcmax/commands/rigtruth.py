@@ -1,0 +1,177 @@
+"""torchcmax rig sync and truth: from a run of a rig and a recording of its camera to ground truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jsonargparse import Namespace
+
+from torchcmax.config import Parser, UsageError
+from torchcmax.io import open
+from torchcmax.io.recording import Recording
+from torchcmax.resultfiles import read_result
+
+if TYPE_CHECKING:  # the extra may be missing
+    from torchcmax.rig.clock import ClockModel, Driven, Seen
+    from torchcmax.rig.config import Rig
+    from torchcmax.rig.truth import Encoded
+
+LOCK, CLOCK = "config.lock.yaml", "clock.json"
+OF_CLOCKS = (CLOCK, "groundtruth.txt", "truth.json")
+BIN = 0.002  # s, in which events are counted
+AWAKE = 0.15  # of the 90 % quantile of events a second: with less, a window is of a camera at rest
+
+
+def sync_options(sub: Parser) -> None:
+    sub.add_argument("run", type=str, help="folder that rig run wrote")
+    sub.add_argument("--result", type=str, default="", help="by velocity: folder that compensate or track wrote of the camera's recording")
+    sub.add_argument("--events", type=str, default="", help="by the rate of events: the camera's recording")
+
+
+def truth_options(sub: Parser) -> None:
+    sub.add_argument("run", type=str, help="folder that rig run wrote and rig sync found the clock of")
+
+
+def sync(config: Namespace) -> None:
+    """clock.json, also of a clock that is not accepted."""
+    from torchcmax.rig.clock import align
+    from torchcmax.rig.record import write_whole
+    from torchcmax.rig.truth import told
+
+    if bool(config.result) == bool(config.events):
+        raise UsageError("give one of --result FOLDER, to align by velocity, and --events RECORDING, to align by the rate of events")
+    out = Path(config.run)
+    rig, encoded = read_run(out)
+    driven, turning = _driven(rig, encoded)
+    if config.result:
+        clock = align(driven, _velocities(Path(config.result), turning), "velocity")
+    else:
+        clock = align(driven, _rates(open(config.events)), "rate")
+    write_whole(out / CLOCK, json.dumps(told(clock), indent=2) + "\n")
+    print(f"clock: {out / CLOCK}")
+    clock.demand()
+    drift = f"{clock.drift * 1e6:.0f} ppm" if clock.drift else f"not known, {clock.drift_sigma * 1e6:.0f} ppm"
+    print(f"the camera's clock is {clock.offset:.6f} s ahead, sigma {clock.sigma * 1e3:.2f} ms; drift {drift}")
+
+
+def truth(config: Namespace) -> None:
+    """groundtruth.txt and what belongs to it."""
+    from torchcmax.rig.errors import Rejected
+    from torchcmax.rig.truth import TRUTH, write_truth
+
+    out = Path(config.run)
+    rig, encoded = read_run(out)
+    clock = _clock(out)
+    said = write_truth(out, rig, encoded, clock)
+    if clock is None:
+        raise Rejected(f"{out}: the camera's clock is not known\n  what to do: torchcmax rig sync {out} --result FOLDER")
+    clock.demand()
+    if not said["truth"]:
+        raise Rejected(f"{out}: the run did not end normally, {encoded.status}\n  what to do: run it again")
+    print(f"truth: {out / TRUTH}")
+
+
+@contextmanager
+def kept(out: Path, rig: Rig) -> Iterator[None]:
+    """What the encoders told by the drives' clock is written down, however the run ended."""
+    try:
+        yield
+    finally:
+        _keep(out, rig)
+
+
+def _keep(out: Path, rig: Rig) -> None:
+    from torchcmax.rig.errors import Refused
+    from torchcmax.rig.truth import write_truth
+
+    try:
+        write_truth(out, rig, read_run(out)[1], None)
+    except Refused:  # it ended before there were samples; why is told by whoever ended it
+        return
+
+
+def read_run(out: Path) -> tuple[Rig, Encoded]:
+    """What a run left in its folder."""
+    from torchcmax.rig.config import load
+    from torchcmax.rig.errors import Refused
+    from torchcmax.rig.record import ENCODER, RUN, read_encoder
+    from torchcmax.rig.truth import Encoded, repeatability
+
+    rig = load(out / LOCK)
+    encoder = read_encoder(out / ENCODER, rig)
+    said = _json(out / RUN)
+    if not isinstance(said.get("status"), str) or not isinstance(said.get("cycles"), list):
+        raise Refused(f"{out / RUN}: says not how the run ended\n  what to do: give the folder that rig run wrote")
+    encoded = Encoded(encoder.time, encoder.place, said["status"], bool(said.get("simulated")))
+    return rig, Encoded(encoder.time, encoder.place, encoded.status, encoded.simulated, repeatability(rig, encoded, said["cycles"]))
+
+
+def _json(path: Path) -> dict[str, Any]:
+    from torchcmax.rig.errors import Refused
+
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise Refused(f"{path}: cannot be read: {error}\n  what to do: give the folder that rig run wrote") from error
+    return found if isinstance(found, dict) else {}
+
+
+def _clock(out: Path) -> ClockModel | None:
+    """As sync left it."""
+    from torchcmax.rig.clock import ClockModel
+    from torchcmax.rig.errors import Refused
+
+    if not (out / CLOCK).exists():
+        return None
+    said: dict[str, Any] = {name: np.inf if value is None else value for name, value in _json(out / CLOCK).items() if name != "accepted"}
+    try:
+        return ClockModel(**said)
+    except TypeError as error:
+        raise Refused(f"{out / CLOCK}: is not what sync writes: {error}\n  what to do: torchcmax rig sync {out}") from error
+
+
+def _driven(rig: Rig, encoded: Encoded) -> tuple[Driven, bool]:
+    """The camera's velocity by the encoders: angular, if any axis turned it; and whether."""
+    from torchcmax.rig.clock import Driven
+    from torchcmax.rig.truth import motion
+
+    inner, v, omega = motion(rig, encoded)
+    turning = bool(np.abs(omega).max() > 0)
+    wide = [np.ptp(encoded.place[:, k]) if (axis.kind == "rotary") == turning else -1.0 for k, axis in enumerate(rig.axes)]
+    return Driven(encoded.time[inner], omega if turning else v, encoded.place[inner, int(np.argmax(wide))]), turning
+
+
+def _velocities(folder: Path, turning: bool) -> Seen:
+    """What a result says of its windows; nan of those in which nothing was seen."""
+    from torchcmax.rig.clock import Seen
+
+    result = read_result(folder)
+    numbers, statuses = result.numbers, result.texts.get("status")
+    start, end = numbers["start_us"] * 1e-6, numbers["end_us"] * 1e-6
+    name = "omega" if turning else "v"
+    value = np.stack([numbers.get(f"{name}_{axis}", np.full(len(start), np.nan)) for axis in "xyz"], -1)
+    rate = numbers["events"] / np.maximum(end - start, 1e-9)
+    known = rate > AWAKE * np.quantile(rate, 0.9) if len(rate) else rate > 0
+    if statuses is not None:
+        known &= np.array([status in ("start", "ok", "weak") for status in statuses], bool)
+    return Seen(start, end, np.where(known[:, None], value, np.nan))
+
+
+def _rates(recording: Recording) -> Seen:
+    """Events a second in short bins."""
+    from torchcmax.rig.clock import Seen
+
+    counts: dict[int, int] = {}
+    for chunk in recording.chunks():
+        bins, events = np.unique(chunk.t // round(BIN * 1e6), return_counts=True)
+        for k, count in zip(bins.tolist(), events.tolist(), strict=True):
+            counts[k] = counts.get(k, 0) + count
+    first, last = (min(counts), max(counts)) if counts else (0, 0)
+    every = np.arange(first + 1, last)  # the outer ones are not whole
+    value = np.array([counts.get(k, 0) for k in every.tolist()], float).reshape(-1, 1) / BIN
+    return Seen(every * BIN, (every + 1) * BIN, value)
