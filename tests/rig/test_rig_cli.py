@@ -61,6 +61,7 @@ def test_plan_prints_every_check_and_touches_nothing(capsys, tmp_path):
     assert "NOT KEPT" not in out
     plan = json.loads((tmp_path / "plan" / "plan.json").read_text())
     assert plan["ok"]
+    assert {path.name for path in (tmp_path / "plan").iterdir()} >= {"motion.png", "oprange_x.png"}
     assert all(check["ok"] for check in plan["checks"])
 
 
@@ -106,7 +107,8 @@ def test_an_interface_that_is_not_there_is_a_lost_link(capsys, profile, tmp_path
 def test_a_dry_run_leaves_everything_that_a_run_does_and_says_so(moved, capsys):
     names = {path.name for path in moved.iterdir()}
     wanted = "config.lock.yaml profile.yaml plan.json encoder.csv log.jsonl run.json groundtruth_driveclock.txt twist.txt truth.json"
-    assert names >= set(wanted.split())
+    assert names == {*wanted.split(), "motion.png", "repeat.png", "oprange_x.png"}
+    assert all((moved / name).read_bytes().startswith(b"\x89PNG") for name in names if name.endswith(".png"))
     assert "groundtruth.txt" not in names
     assert (moved / "config.lock.yaml").read_bytes() == SLIDER.read_bytes()
     said_ = json.loads((moved / "truth.json").read_text())

@@ -13,7 +13,7 @@ from torchcmax.io.trajectory import read_trajectory
 from torchcmax.rig.axis import Chain, from_quadcounts, quadcounts, quantum
 from torchcmax.rig.clock import ClockModel
 from torchcmax.rig.errors import Refused
-from torchcmax.rig.truth import ENDED, Encoded, sigma, write_truth
+from torchcmax.rig.truth import ENDED, Encoded, repeatability, sigma, write_truth
 
 CLOCK = ClockModel(12.345, 40e-6, 2e-4, 5e-6, "velocity", 0.8)
 TIME = np.arange(2001) * 1e-3
@@ -108,3 +108,13 @@ def test_too_few_samples_are_refused(slider, tmp_path):
     few = Encoded(TIME[:20], np.zeros((20, 1)), ENDED, True)
     with pytest.raises(Refused, match="20 samples"):
         write_truth(tmp_path, slider, few, CLOCK)
+
+
+def test_repeatability_is_the_spread_of_the_cycles_where_it_is_largest(slider):
+    way = np.linspace(0, 0.3, 101)
+    off = np.zeros(101)
+    off[50] = 1e-3
+    place = np.concatenate([way + off, np.full(7, 0.3), way - off])[:, None]  # on its way back it need not be the same
+    assert repeatability(slider, place, [(0, 101), (108, 209)]) == {"x": pytest.approx(math.sqrt(2) * 1e-3)}
+    assert repeatability(slider, place, [(0, 101)]) is None
+    assert repeatability(slider, place, []) is None

@@ -19,6 +19,8 @@ from torchcmax.resultfiles import read_result
 if TYPE_CHECKING:  # the extra may be missing
     from torchcmax.rig.clock import ClockModel, Driven, Seen
     from torchcmax.rig.config import Rig
+    from torchcmax.rig.demand import Samples
+    from torchcmax.rig.record import Encoder
     from torchcmax.rig.truth import Encoded
 
 LOCK, CLOCK = "config.lock.yaml", "clock.json"
@@ -77,38 +79,66 @@ def truth(config: Namespace) -> None:
 
 
 @contextmanager
-def kept(out: Path, rig: Rig) -> Iterator[None]:
-    """What the encoders told by the drives' clock is written down, however the run ended."""
+def kept(out: Path, rig: Rig, planned: Samples | None = None) -> Iterator[None]:
+    """What the encoders told by the drives' clock is written down and drawn, however the run ended."""
     try:
         yield
     finally:
-        _keep(out, rig)
+        _keep(out, rig, planned)
 
 
-def _keep(out: Path, rig: Rig) -> None:
+def _keep(out: Path, rig: Rig, planned: Samples | None) -> None:
+    from torchcmax.rig import picture
     from torchcmax.rig.errors import Refused
     from torchcmax.rig.truth import write_truth
 
     try:
-        write_truth(out, rig, read_run(out)[1], None)
+        _, encoder, said = _read(out)
+        write_truth(out, rig, _encoded(rig, encoder, said), None)
     except Refused:  # it ended before there were samples; why is told by whoever ended it
         return
+    save(out / "motion.png", picture.motion(rig, planned, encoder))
+    cycles = _cycles(rig, said)
+    if len(cycles) > 1:
+        save(out / "repeat.png", picture.repeats(rig, encoder, cycles))
+
+
+def save(path: Path, content: bytes) -> None:
+    """Under another name until it is whole."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(content)
+    part.replace(path)
 
 
 def read_run(out: Path) -> tuple[Rig, Encoded]:
     """What a run left in its folder."""
+    rig, encoder, said = _read(out)
+    return rig, _encoded(rig, encoder, said)
+
+
+def _read(out: Path) -> tuple[Rig, Encoder, dict[str, Any]]:
     from torchcmax.rig.config import load
     from torchcmax.rig.errors import Refused
     from torchcmax.rig.record import ENCODER, RUN, read_encoder
-    from torchcmax.rig.truth import Encoded, repeatability
 
     rig = load(out / LOCK)
-    encoder = read_encoder(out / ENCODER, rig)
-    said = _json(out / RUN)
+    encoder, said = read_encoder(out / ENCODER, rig), _json(out / RUN)
     if not isinstance(said.get("status"), str) or not isinstance(said.get("cycles"), list):
-        raise Refused(f"{out / RUN}: says not how the run ended\n  what to do: give the folder that rig run wrote")
-    encoded = Encoded(encoder.time, encoder.place, said["status"], bool(said.get("simulated")))
-    return rig, Encoded(encoder.time, encoder.place, encoded.status, encoded.simulated, repeatability(rig, encoded, said["cycles"]))
+        raise Refused(f"{out / RUN}: does not say how the run ended\n  what to do: give the folder that rig run wrote")
+    return rig, encoder, said
+
+
+def _encoded(rig: Rig, encoder: Encoder, said: dict[str, Any]) -> Encoded:
+    from torchcmax.rig.truth import Encoded, repeatability
+
+    again = repeatability(rig, encoder.place, _cycles(rig, said))
+    return Encoded(encoder.time, encoder.place, said["status"], bool(said.get("simulated")), again)
+
+
+def _cycles(rig: Rig, said: dict[str, Any]) -> list[tuple[int, int]]:
+    """First and last sample of each cycle that was run to its end."""
+    every = 1 / (rig.rate * rig.bus.sync_period)
+    return [(round(first / every), round(last / every)) for first, last in said["cycles"]]
 
 
 def _json(path: Path) -> dict[str, Any]:

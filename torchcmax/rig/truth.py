@@ -97,16 +97,15 @@ def motion(rig: Rig, encoded: Encoded) -> tuple[slice, np.ndarray, np.ndarray]:
     return inner, *Chain(rig).twist(place[inner], rate[inner])
 
 
-def repeatability(rig: Rig, encoded: Encoded, cycles: Sequence[Sequence[int]]) -> dict[str, float] | None:
+def repeatability(rig: Rig, place: np.ndarray, cycles: Sequence[tuple[int, int]]) -> dict[str, float] | None:
     """Of each axis, m or rad: the largest standard deviation, over the cycles, of where it was at the same time; None of a single one.
 
-    cycles: first and last SYNC of each
+    place [K, A] | cycles: first and last sample of each
     """
-    rows = [np.searchsorted(encoded.time, np.array(cycle) * rig.bus.sync_period - 1e-9) for cycle in cycles]
-    length = min((last - first for first, last in rows), default=0)
-    if len(rows) < 2 or length < 1:
+    length = min((last - first for first, last in cycles), default=0)
+    if len(cycles) < 2 or length < 1:
         return None
-    again = np.stack([encoded.place[first : first + length] for first, _ in rows])
+    again = np.stack([place[first : first + length] for first, _ in cycles])
     return {axis.name: float(spread) for axis, spread in zip(rig.axes, again.std(0, ddof=1).max(0), strict=True)}
 
 
