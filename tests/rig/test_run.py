@@ -192,7 +192,7 @@ def test_both_families_are_driven(slider, tmp_path):
     with rig_on_bus(older) as simulation:
         said = run(older, program(), tmp_path, simulate=True, network=simulation.host)
         assert said["status"] == "complete"
-        with pytest.raises(Refused, match="0x6080:00 cannot be set.*Object does not exist"):  # the configuration says another family
+        with pytest.raises(Refused, match=r"0x6080:00 cannot be set.*Object does not exist"):  # the configuration says another family
             run(slider, program(), tmp_path, simulate=True, network=simulation.host)
 
 

@@ -155,8 +155,7 @@ def _run(config: Namespace) -> None:
     _write_plan(out, config, plan)
     with _watched(config, plan.program.duration * config.repeat, plan.rig) as watch, rigtruth.kept(out, plan.rig, plan.samples):
         told = {"simulate": config.dry_run, "arm": config.arm, "repeat": config.repeat, "reset": config.reset_fault}
-        said = run(plan.rig, plan.program, out, watch=watch, **told)
-    _show(out, plan, [(first, last) for first, last in said["cycles"]])
+        run(plan.rig, plan.program, out, watch=watch, **told)
     print(f"run: {out}, {'simulated' if config.dry_run else plan.rig.name}; the clock is next: torchcmax rig sync {out} --help")
 
 
@@ -229,7 +228,6 @@ def _table(plan: Plan) -> str:
 def _write_plan(out: Path, config: Namespace, plan: Plan) -> None:
     """plan.json, pictures of it, and what it was made of."""
     from torchcmax.rig import picture
-    from torchcmax.rig import picture
     from torchcmax.rig.record import write_whole
 
     _begin(out, config)
@@ -238,20 +236,6 @@ def _write_plan(out: Path, config: Namespace, plan: Plan) -> None:
     write_whole(out / "motion.png", picture.motion(plan.rig, plan.samples, None))
     for k, axis in enumerate(plan.rig.axes):
         write_whole(out / f"oprange_{axis.name}.png", picture.operating_range(plan.rig, k, plan.samples))
-
-
-def _show(out: Path, plan: Plan, cycles: list[tuple[int, int]]) -> None:
-    """What was measured, on what was planned; and how alike the cycles are."""
-    from torchcmax.rig import picture
-    from torchcmax.rig.record import ENCODER, read_encoder, write_whole
-
-    encoder = read_encoder(out / ENCODER, plan.rig)
-    write_whole(out / "motion.png", picture.motion(plan.rig, plan.samples, encoder))
-    if len(cycles) > 1:
-        write_whole(out / "repeat.png", picture.repeats(plan.rig, encoder, cycles))
-    rigtruth.save(out / "motion.png", picture.motion(plan.rig, plan.samples, None))
-    for k, axis in enumerate(plan.rig.axes):
-        rigtruth.save(out / f"oprange_{axis.name}.png", picture.operating_range(plan.rig, k, plan.samples))
 
 
 def _begin(out: Path, config: Namespace) -> None:
