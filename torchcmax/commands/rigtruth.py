@@ -90,6 +90,7 @@ def kept(out: Path, rig: Rig, planned: Samples | None = None) -> Iterator[None]:
 def _keep(out: Path, rig: Rig, planned: Samples | None) -> None:
     from torchcmax.rig import picture
     from torchcmax.rig.errors import Refused
+    from torchcmax.rig.record import write_whole
     from torchcmax.rig.truth import write_truth
 
     try:
@@ -97,17 +98,10 @@ def _keep(out: Path, rig: Rig, planned: Samples | None) -> None:
         write_truth(out, rig, _encoded(rig, encoder, said), None)
     except Refused:  # it ended before there were samples; why is told by whoever ended it
         return
-    save(out / "motion.png", picture.motion(rig, planned, encoder))
+    write_whole(out / "motion.png", picture.motion(rig, planned, encoder))
     cycles = _cycles(rig, said)
     if len(cycles) > 1:
-        save(out / "repeat.png", picture.repeats(rig, encoder, cycles))
-
-
-def save(path: Path, content: bytes) -> None:
-    """Under another name until it is whole."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(content)
-    part.replace(path)
+        write_whole(out / "repeat.png", picture.repeats(rig, encoder, cycles))
 
 
 def read_run(out: Path) -> tuple[Rig, Encoded]:
