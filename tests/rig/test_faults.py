@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 
 import pytest
 from bus import CONTROL, program, rig_on_bus, sync
@@ -90,8 +91,11 @@ def test_a_drive_that_faults(slider, tmp_path, name, value, match):
     assert 20 < len(last) <= 200
 
 
-def test_any_other_fault_is_told_by_its_number(slider, tmp_path):
-    simulation = failing(slider, tmp_path, DriveFault, r"0x7320", act=lambda s: s.drives[0].fault(0x7320))
+@pytest.mark.parametrize("family", ["epos4", "epos2"])
+def test_any_other_fault_is_told_by_its_number(slider, tmp_path, family):
+    """An EPOS2 tells it in an emergency message alone."""
+    rig = replace(slider, axes=(replace(slider.axes[0], family=family),))
+    simulation = failing(rig, tmp_path, DriveFault, r"0x7320", act=lambda s: s.drives[0].fault(0x7320))
     stands(simulation)
 
 
@@ -170,8 +174,6 @@ def test_a_mode_that_is_refused(slider, tmp_path):
 
 
 def test_a_wrong_serial_number(slider, tmp_path):
-    from dataclasses import replace
-
     other = replace(slider, axes=(replace(slider.axes[0], serial=7),))
     assert failing(other, tmp_path, Refused, "its serial number is 12345678, not 7").ear.controlwords() == []
 

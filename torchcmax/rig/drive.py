@@ -23,7 +23,7 @@ class Told(NamedTuple):
 
     statusword: int = 0
     mode: int = 0
-    error: int = 0
+    error: int = 0  # of an EPOS2 always 0
     position: int = 0
     velocity: int = 0
     current: int = 0
@@ -58,7 +58,8 @@ class Drive:
             self._parts[pdo.number] = pdo.unpack(bytes(data))
             self.heard.add(pdo.number)
             if len(self.heard) == 3:
-                self.told = Told(*self._parts[1], *self._parts[2], *self._parts[3])
+                status = (*self._parts[1], 0)[:3]
+                self.told = Told(*status, *self._parts[2], *self._parts[3])
         except Exception as error:
             self.broken = error
 
@@ -138,7 +139,7 @@ class Drive:
 
     def configure(self, timeout: float) -> dict[str, int]:
         """Write limits, supervision and the PDO mapping, and read all of it back; Refused where anything differs."""
-        wanted = o.settings(self.axis, timeout)
+        wanted = {obj: value for obj, value in o.settings(self.axis, timeout).items() if self.has(obj)}
         for obj, value in wanted.items():
             self.write(obj, value)
         for pdo in self.pdos:
@@ -148,6 +149,16 @@ class Drive:
                 remedy = "look whether the drive's firmware knows the value, or a parameter lock is on"
                 raise Refused(f"{self}: {obj} was set to {value} and reads {found}\n  what to do: {remedy}")
         return {str(obj): value for obj, value in wanted.items()}
+
+    def has(self, obj: Object) -> bool:
+        """Whether its firmware has an object that is not wanted of all."""
+        if obj not in self.family.optional:
+            return True
+        try:
+            self.read(obj)
+        except Refused:
+            return False
+        return True
 
     def _map(self, pdo: Pdo) -> dict[Object, int]:
         """Write a PDO's mapping, as CiA 301 wants it: off, emptied, filled, on -> what must then be read."""
@@ -159,12 +170,15 @@ class Drive:
         }
         self.write(cob_id, here | o.OFF)
         self.write(kind, pdo.transmission)
+        quiet = {Object(pdo.communication, 3, "u16"): 0} if pdo.send else {}  # EPOS4's inhibit time leaves SYNCs unanswered
+        for obj, value in quiet.items():
+            self.write(obj, value)
         self.write(count, 0)
         for obj, value in entries.items():
             self.write(obj, value)
         self.write(count, len(entries))
         self.write(cob_id, here)
-        return {cob_id: here, kind: pdo.transmission, count: len(entries), **entries}
+        return {cob_id: here, kind: pdo.transmission, count: len(entries), **quiet, **entries}
 
     # -- its commands, which it takes with the next SYNC
 
@@ -197,4 +211,5 @@ class Drive:
         if self.state in (State.FAULT, State.FAULTING):
             axis = self.axis
             where = f"at {self.place:.4f} {'m' if axis.kind == 'linear' else 'rad'}, {self.told.following} quadcounts behind its demand"
-            raise DriveFault(f"{self}: {o.error_text(self.told.error)}, {where}\n  what to do: remove the cause; then --reset-fault")
+            code = self.told.error or next((entry.code for entry in reversed(self.node.emcy.log) if entry.code), 0)
+            raise DriveFault(f"{self}: {o.error_text(code)}, {where}\n  what to do: remove the cause; then --reset-fault")

@@ -61,7 +61,6 @@ PROFILE_TYPE = Object(0x6086, 0, "i16")
 HOMING_METHOD, HOMING_SPEED, HOMING_SLOWLY = Object(0x6098, 0, "i8"), Object(0x6099, 1, "u32"), Object(0x6099, 2, "u32")
 HOMING_ACCELERATION = Object(0x609A, 0, "u32")
 VELOCITY_UNIT = Object(0x60A9, 0, "u32")
-FOLLOWING = Object(0x60F4, 0, "i32")
 TARGET_VELOCITY = Object(0x60FF, 0, "i32")
 SUPPORTED = Object(0x6502, 0, "u32")
 RPM_UNIT = 0x00B44700  # of 0x60A9: revolutions per minute
@@ -71,10 +70,15 @@ OBJECTS = [value for value in globals().values() if isinstance(value, Object)]
 
 @dataclass(frozen=True)
 class Drive:
-    """What only one family has.  nominal_current mA, peak_current mA, thermal_time 0.1 s, max_speed rpm, home: position of home, qc"""
+    """What differs between families.  nominal_current mA, peak_current mA, thermal_time 0.1 s, max_speed rpm, home: its position, qc
+
+    status: what is told beside the statusword; an EPOS2 tells errors by emergency messages alone
+    optional: settings that not every firmware has
+    """
 
     name: str
     current: Object
+    following: Object
     nominal_current: Object
     peak_current: Object
     pole_pairs: Object
@@ -83,18 +87,22 @@ class Drive:
     home: Object
     soft_limit: int
     limit_switch: int
+    status: tuple[Object, ...]
+    optional: tuple[Object, ...]
 
     @property
     def objects(self) -> list[Object]:
         own = [value for value in vars(self).values() if isinstance(value, Object)]
-        return OBJECTS + own
+        return [obj for obj in OBJECTS if obj not in self.optional] + own
 
 
 FAMILIES: dict[str, Drive] = {
-    "epos4": Drive("EPOS4", Object(0x30D1, 2, "i32"), Object(0x3001, 1, "u32"), Object(0x3001, 2, "u32"), Object(0x3001, 3, "u8"),
-                   Object(0x3001, 4, "u16"), Object(0x6080, 0, "u32"), Object(0x30B0, 0, "i32"), 0x8A82, 0x8A80),
-    "epos2": Drive("EPOS2", Object(0x6078, 0, "i16"), Object(0x6410, 1, "u16"), Object(0x6410, 2, "u16"), Object(0x6410, 3, "u8"),
-                   Object(0x6410, 5, "u16"), Object(0x6410, 4, "u32"), Object(0x2081, 0, "i32"), 0xFF09, 0xFF06),
+    "epos4": Drive("EPOS4", Object(0x30D1, 2, "i32"), Object(0x60F4, 0, "i32"), Object(0x3001, 1, "u32"), Object(0x3001, 2, "u32"),
+                   Object(0x3001, 3, "u8"), Object(0x3001, 4, "u16"), Object(0x6080, 0, "u32"), Object(0x30B0, 0, "i32"), 0x8A82, 0x8A80,
+                   (MODE_SHOWN, ERROR_CODE), ()),
+    "epos2": Drive("EPOS2", Object(0x6078, 0, "i16"), Object(0x20F4, 0, "i16"), Object(0x6410, 1, "u16"), Object(0x6410, 2, "u16"),
+                   Object(0x6410, 3, "u8"), Object(0x6410, 5, "u16"), Object(0x6410, 4, "u32"), Object(0x2081, 0, "i32"), 0xFF09, 0xFF06,
+                   (MODE_SHOWN,), (ABORT_OPTION, QUICK_STOP_OPTION, FAULT_OPTION)),
 }  # fmt: skip
 
 PROFILE_POSITION, PROFILE_VELOCITY_MODE, HOMING = 1, 3, 6
@@ -184,9 +192,9 @@ def pdos(family: str) -> tuple[Pdo, ...]:
         Pdo(2, 0x300, False, 255, (TARGET_POSITION, PROFILE_VELOCITY)),
         Pdo(3, 0x400, False, 255, (ACCELERATION, DECELERATION)),
         Pdo(4, 0x500, False, 1, (MODE, TARGET_VELOCITY)),
-        Pdo(1, 0x180, True, 1, (STATUSWORD, MODE_SHOWN, ERROR_CODE)),
+        Pdo(1, 0x180, True, 1, (STATUSWORD, *FAMILIES[family].status)),
         Pdo(2, 0x280, True, 1, (POSITION, VELOCITY)),
-        Pdo(3, 0x380, True, 1, (FAMILIES[family].current, FOLLOWING)),
+        Pdo(3, 0x380, True, 1, (FAMILIES[family].current, FAMILIES[family].following)),
     )
 
 

@@ -233,6 +233,7 @@ class Session:
         for i, drive in enumerate(self.drives):
             self.enable({i: o.HOMING})
             drive.control(o.START)
+            self.rest(ANSWER_TIME)  # what it answers before is of an earlier homing
             self.until(lambda d=drive: d.shows(o.ANSWERED) or d.shows(o.OFFSIDE), HOME_TIME, f"{drive}: home was not found")  # type: ignore[misc]
             if drive.shows(o.OFFSIDE):
                 raise DriveFault(f"{drive}: homing failed\n  what to do: look at the switch and at homing.method in the configuration")
@@ -458,7 +459,7 @@ def check(rig: Rig, *, simulate: bool, seconds: float = 1.0, network: canopen.Ne
     for axis in rig.axes:
         drive = Drive(network, axis)
         state = o.state_of(drive.read(o.STATUSWORD))
-        wanted = o.settings(axis, rig.bus.heartbeat_timeout)
+        wanted = {obj: value for obj, value in o.settings(axis, rig.bus.heartbeat_timeout).items() if drive.has(obj)}
         found[axis.name] = {
             **drive.identify(set()),
             "modes": o.bits(drive.read(o.SUPPORTED)),

@@ -124,7 +124,7 @@ def _defaults(family: str) -> dict[Object, int]:
     """As delivered: no heartbeat, soft limits off, and the controlword in every RPDO."""
     defaults = {
         o.VENDOR_ID: o.VENDOR, o.PRODUCT: 0x60630000 if family == "epos4" else 0x63220000, o.SERIAL: 12345678, o.SUPPORTED: 0b100101,
-        o.ABORT_OPTION: 3, o.QUICK_STOP_OPTION: 6, o.FAULT_OPTION: 2, o.FOLLOWING_WINDOW: 2000, o.VELOCITY_UNIT: o.RPM_UNIT,
+        o.FOLLOWING_WINDOW: 2000, o.VELOCITY_UNIT: o.RPM_UNIT,
         o.MODE: 1, o.QUICK_STOP: 10000, o.ACCELERATION: 10000, o.DECELERATION: 10000, o.PROFILE_VELOCITY: 1000,
         o.MAX_PROFILE_VELOCITY: 50000, o.HOMING_METHOD: 7, o.HOMING_SPEED: 100, o.HOMING_SLOWLY: 10, o.HOMING_ACCELERATION: 1000,
     }  # fmt: skip
@@ -134,6 +134,7 @@ def _defaults(family: str) -> dict[Object, int]:
             where, what = base + number - 1, kind + number - 1
             defaults[Object(where, 1, "u32")] = o.OFF
             defaults[Object(where, 2, "u8")] = 255
+            defaults[Object(where, 3, "u16")] = 10 if base == 0x1800 else 0  # inhibit time, 0.1 ms
             defaults[Object(what, 0, "u8")] = len(mapped)
             for sub in range(1, 9):
                 entry = mapped[sub - 1] if sub <= len(mapped) else None
@@ -218,7 +219,7 @@ class SimulatedDrive:
             return round(self.plant.velocity * 30 / math.pi)
         if obj == self.family.current:
             return round(self.plant.current * 1e3)
-        if obj == o.FOLLOWING:
+        if obj == self.family.following:
             return self.following
         return None
 
