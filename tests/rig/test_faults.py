@@ -149,6 +149,28 @@ def test_a_drive_that_is_no_longer_heard(slider, tmp_path, how):
     stands(simulation)
 
 
+@pytest.mark.parametrize("which", [0x80, 0x77F])
+def test_the_bus_is_gone(slider, tmp_path, which):
+    """What python-can raises when the bus is off or the queue is full, at a SYNC or at a heartbeat."""
+    import can
+
+    def act(simulation):
+        marked(simulation)
+        send = simulation.host.wire.send
+
+        def broken(message, timeout=None):
+            if message.arbitration_id == which:
+                raise can.CanOperationError("Network is down")
+            send(message, timeout)
+
+        simulation.host.wire.send = broken
+
+    simulation = failing(slider, tmp_path, LinkLost, r"the bus is gone: Network is down", act=act)
+    assert simulation.caught.code == 4
+    assert any(can_id == 0 and data == b"\x02\x01" for can_id, data in simulation.ear.frames[simulation.mark :])
+    never_enabled_after(simulation, simulation.mark)
+
+
 @pytest.mark.parametrize(
     ("faults", "match"),
     [

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -102,10 +103,7 @@ class Session:
         self.k += 1
         for drive in self.drives:
             drive.heard.clear()
-        try:
-            self.network.sync.transmit()
-        except can.CanError as error:
-            raise LinkLost(f"the bus is gone: {error}\n  what to do: look at the interface and the cable") from error
+        self.network.sync.transmit()
         received = self._answers()
         if self.recording:
             self.recorder.take(self.k - self.begin, self.drives, received)
@@ -330,7 +328,7 @@ class Session:
         self.stopping, self.recording = True, self.recording and error is not None
         self.recorder.note(self.k, "stopping", reason="done" if error is None else f"{type(error).__name__}: {error}")
         try:
-            if isinstance(error, LinkLost):
+            if isinstance(error, LinkLost | can.CanError):
                 raise error
             moving = [drive for drive in self.drives if drive.state not in (State.FAULT, State.FAULTING)]
             if error is not None:
@@ -364,11 +362,10 @@ class Session:
         """Without answers: no more heartbeat, so that drives stop by themselves; and three times what would stop them now."""
         self.recorder.note(self.k, "link lost", reason=str(lost))
         for _ in range(3):
-            for drive in self.drives:
+            stops = [partial(drive.control, o.QUICK) for drive in self.drives]
+            for send in (*stops, self.network.sync.transmit, partial(self._command, 2)):
                 try:
-                    drive.control(o.QUICK)
-                    self.network.sync.transmit()
-                    drive.node.nmt.send_command(2)
+                    send()
                 except (can.CanError, RuntimeError) as error:
                     self.recorder.note(self.k, "not sent", reason=str(error))
 
@@ -478,6 +475,11 @@ def check(rig: Rig, *, simulate: bool, seconds: float = 1.0, network: canopen.Ne
     return found
 
 
+def _bus_gone(error: can.CanError) -> LinkLost:
+    """Bus off, a full queue, an interface that went down."""
+    return LinkLost(f"the bus is gone: {error}\n  what to do: look at the interface (ip -details link show), cable and termination")
+
+
 def _armed(simulate: bool, arm: bool) -> None:
     if not (simulate or arm):
         remedy = "try --dry-run first; give --arm when nobody is within reach of the rig and the emergency stop is in yours"
@@ -501,9 +503,12 @@ def _session(
             session.healthy(reset)
             session.configure()
             work(session, said)
-    except BaseException as error:
+    except BaseException as caught:
+        error = _bus_gone(caught) if isinstance(caught, can.CanError) else caught
         said["status"] = f"aborted: {error}" if isinstance(error, RigError) else f"aborted: {type(error).__name__}: {error}"
         said["last"] = recorder.rows[-LAST:]
+        if error is not caught:
+            raise error from caught
         raise
     finally:
         (out / "groundtruth.txt").unlink(missing_ok=True)  # of an older run: not of this one
