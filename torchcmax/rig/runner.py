@@ -362,7 +362,7 @@ class Session:
         """Without answers: no more heartbeat, so that drives stop by themselves; and three times what would stop them now."""
         self.recorder.note(self.k, "link lost", reason=str(lost))
         for _ in range(3):
-            stops = [partial(drive.control, o.QUICK) for drive in self.drives]
+            stops: list[Callable[[], object]] = [partial(drive.control, o.QUICK) for drive in self.drives]
             for send in (*stops, self.network.sync.transmit, partial(self._command, 2)):
                 try:
                     send()
