@@ -363,7 +363,8 @@ class Session:
         self.recorder.note(self.k, "link lost", reason=str(lost))
         for _ in range(3):
             stops: list[Callable[[], object]] = [partial(drive.control, o.QUICK) for drive in self.drives]
-            for send in (*stops, self.network.sync.transmit, partial(self._command, 2)):
+            stops += [self.network.sync.transmit, partial(self._command, 2)]
+            for send in stops:
                 try:
                     send()
                 except (can.CanError, RuntimeError) as error:
