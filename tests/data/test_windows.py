@@ -1,6 +1,8 @@
 """Datasets of windows: every window once and the same, however it is reached, and its truth."""
 
+import copy
 import pickle
+from collections import OrderedDict
 
 import numpy as np
 import pytest
@@ -194,6 +196,74 @@ def test_living_workers_hear_of_the_epoch(file):
     dataset.set_epoch(1)
     assert not any(equal(a, b) for a, b in zip(first, loader, strict=True))
     assert all(equal(a, b) for a, b in zip(loader, (dataset[i] for i in range(len(dataset))), strict=True))
+
+
+def test_copies_hear_of_their_own_epoch(file):
+    dataset = WindowDataset(file, 90, transform=Augment(CAMERA))
+    for copied in (copy.deepcopy(dataset), pickle.loads(pickle.dumps(dataset))):
+        loader = DataLoader(copied, batch_size=None, num_workers=1, persistent_workers=True)
+        first = list(loader)
+        copied.set_epoch(1)
+        assert not any(equal(a, b) for a, b in zip(first, loader, strict=True))
+    assert equal(dataset[0], first[0])
+
+
+@pytest.mark.parametrize(("events", "stride", "workers"), [(90, 45, 4), (100, 75, 4), (90, 70, 2)])
+def test_ranks_differ_by_one_window_at_most(file, events, stride, workers):
+    counts = [len(list(DataLoader(WindowStream(file, events, stride, shard=(rank, 2)), None, num_workers=workers))) for rank in (0, 1)]
+    assert abs(counts[0] - counts[1]) <= 1
+
+
+def test_recordings_without_a_file_are_not_mixed_up_in_the_cache(tmp_path):
+    first, second = (recording(tmp_path, "gone", seed=seed) for seed in (1, 2))
+    a, b = (WindowDataset(one, 100, cache=tmp_path / "cache") for one in (first, second))
+    assert not equal(a[0].window, b[0].window)
+
+
+def test_a_window_without_duration_has_no_known_motion(tmp_path):
+    whole = recording(tmp_path)
+    (events,) = whole.chunks()
+    still = Events(events.t // 20_000 * 20_000, events.x, events.y, events.p)
+    dataset = WindowDataset(Recording(whole.path, "r", CAMERA, lambda: iter([still]), 1000, whole.truth, whole.plane), 50)
+    batch = collate([dataset[i] for i in range(len(dataset))])
+    empty = batch.window.duration == 0
+    assert empty.any()
+    assert batch.omega[empty].isnan().all()
+    assert torch.equal(batch.known, ~empty & batch.omega.isfinite().all(-1))
+    assert batch[batch.known].omega.isfinite().all()
+
+
+def test_an_error_in_a_worker_is_the_same_error(file):
+    error = DataError("a.h5", "is broken", "mend it", "event 3")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.path, again.place) == (str(error), error.path, "event 3")
+    with pytest.raises(DataError, match="fewer than one window"):
+        list(DataLoader(WindowStream(file, 2000), None, num_workers=1))
+
+
+def test_more_recordings_than_files_may_be_open(tmp_path, monkeypatch):
+    opened = OrderedDict()
+    monkeypatch.setattr("torchcmax.io.hdf5._opened", opened)
+    monkeypatch.setattr("torchcmax.io.hdf5.MOST_OPEN", 3)
+    for i in range(7):
+        save(recording(tmp_path, f"r{i}", 300, seed=i), tmp_path / f"r{i}.h5")
+    dataset = WindowDataset([tmp_path / f"r{i}.h5" for i in range(7)], 100)
+    expected = [list(open(tmp_path / f"r{i}.h5").windows(100)) for i in range(7)]
+    for i in np.random.default_rng(0).integers(0, 21, 60):
+        assert torch.equal(dataset[int(i)].window.ray, expected[i // 3][i % 3].ray)
+    assert len(opened) <= 3
+
+
+def test_a_window_that_begins_before_the_last_one_ended_is_refused(tmp_path):
+    import h5py
+
+    save(recording(tmp_path), tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5", "r+") as opened:
+        opened["events/t"][199] = opened["events/t"][200] + 50
+    dataset = WindowDataset(tmp_path / "r.h5", 100)
+    assert dataset[1].event == 100
+    with pytest.raises(DataError, match="event 201 is earlier"):
+        dataset[2]
 
 
 def test_a_loader_shuffles_by_its_seed(file):

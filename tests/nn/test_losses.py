@@ -146,6 +146,51 @@ def test_a_window_without_events_costs_nothing_and_has_no_gradient():
     torch.testing.assert_close(ContrastLoss(CAMERA)(window, omega, vector(VELOCITY)), loss[0])
 
 
+@pytest.mark.parametrize("velocity", [(0.4, 0.2, -0.1), (0.0, 0.0, 5.0)])
+def test_padding_and_weights_of_zero_change_nothing_before_a_plane(velocity):
+    """Nor what the guard watches: a camera that comes very near."""
+    window = turning()
+    v, n, omega = vector(velocity), vector(NORMAL), vector(OMEGA)
+    loss = ContrastLoss(CAMERA, reduction="none")
+    expected = loss(window, omega, v, n)
+    for more in (200, 1000, 20_000):
+        torch.testing.assert_close(loss(padded(window, more), omega, v, n), expected)
+    weight = torch.ones_like(window.dt)
+    weight[:, ::3] = 0
+    muted = Window(window.ray, window.dt, window.polarity * weight, window.start, window.duration)
+    torch.testing.assert_close(loss(window, omega, v, n, weight), loss(muted, omega, v, n))
+
+
+def test_what_is_not_known_of_a_window_without_events_leaves_no_trace():
+    window, unknown = turning(), torch.tensor([[0.0], [torch.nan]], dtype=torch.float64)
+    weight = torch.ones_like(window.dt)
+    weight[1] = 0
+    omega, v, n = ((vector(x) + unknown).requires_grad_() for x in (OMEGA, VELOCITY, NORMAL))
+    ContrastLoss(CAMERA)(window, omega, v, n, weight).backward()
+    flow = (torch.zeros(2, 2, 24, 32, dtype=torch.float64) + unknown[:, :, None, None]).requires_grad_()
+    FlowContrastLoss(CAMERA)(window, flow, weight).backward()
+    for part in (omega, v, n, flow):
+        assert part.grad.isfinite().all()
+        assert (part.grad[1] == 0).all()
+    assert (omega.grad[0] != 0).any()
+
+
+@pytest.mark.parametrize("model", ["rotation", "translation", "planar"])
+@pytest.mark.parametrize("empty", [[1], [0, 1]])
+def test_windows_without_events_do_not_disturb_the_others_of_a_batch(model, empty):
+    window = turning(dtype=torch.float32)
+    weight = torch.ones_like(window.dt)
+    weight[empty] = 0
+    weight.requires_grad_()
+    found = Compensate(CAMERA, model)(window, weight)
+    (found.omega.square().sum() + found.velocity.square().sum()).backward()
+    assert weight.grad.isfinite().all()
+    assert (weight.grad[empty] == 0).all()
+    assert all((weight.grad[i] != 0).any() for i in range(2) if i not in empty)
+    with pytest.raises(ValueError, match="weight wants"):
+        Compensate(CAMERA, model)(window, weight[0])
+
+
 def test_the_loss_compares_between_windows_and_sizes():
     """Twice the events on twice the pixels: as sharp."""
     loss = ContrastLoss(CAMERA, reduction="none", contrast="mean_square", blur=0.0)

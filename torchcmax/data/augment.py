@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from torchcmax.core import so3
-from torchcmax.core.camera import Camera, Canvas
+from torchcmax.core.camera import Camera
 from torchcmax.core.window import Window
+from torchcmax.data.represent import exact
 from torchcmax.data.sample import Sample
+from torchcmax.data.windows import table_of
 
 
 def flip(sample: Sample, which: Tensor, axis: int) -> Sample:
@@ -37,7 +39,8 @@ def flip(sample: Sample, which: Tensor, axis: int) -> Sample:
 def reverse(sample: Sample, which: Tensor) -> Sample:
     """Some samples backwards in time: the last event is the first, and what became brighter becomes darker.  which [B] bool.
 
-    The camera at the last event is the new reference: the motion is seen from there, back, as are plane and pose.
+    The camera at the last event is the new reference: the motion is seen from there, back, as are plane and pose.  `start` and `event`
+    stay those of the stretch.
     """
     window = sample.window
     order = torch.where(which[:, None], _backwards(window), torch.arange(window.ray.shape[1], device=which.device))
@@ -47,9 +50,9 @@ def reverse(sample: Sample, which: Tensor) -> Sample:
     last = sample.displacement().seen_at(1.0)
     seconds = window.duration[:, None]
     back = -last.shift / torch.where(seconds > 0, seconds, 1.0)
-    back = torch.where(sample.velocity == 0, 0.0, back)  # known even where the plane is not
-    step = sample.velocity * seconds * sample.distance[:, None]
-    step = torch.where(sample.velocity == 0, 0.0, step)
+    still = (sample.velocity == 0).all(-1, keepdim=True)  # known even where the plane is not
+    back = torch.where(still, 0.0, back)
+    step = torch.where(still, 0.0, sample.velocity * seconds * sample.distance[:, None])
     there = {
         "omega": -sample.omega,
         "velocity": back,
@@ -76,30 +79,30 @@ def drop(sample: Sample, share: float, chance: torch.Generator) -> Sample:
 
 
 def disturb(sample: Sample, share: float, camera: Camera, chance: torch.Generator) -> Sample:
-    """Adds events that mean nothing, anywhere on the sensor at any time of the window: a share of the number that is there."""
+    """Adds events that mean nothing, at any pixel at any time of the window: a share of the number that each window has."""
     window = sample.window
-    count = round(share * window.ray.shape[1])
+    wanted = (share * (window.polarity != 0).sum(1, keepdim=True)).round()
+    count = int(wanted.max())
     if not count:
         return sample
-    u, v, when, sign = (_random(window.dt[:, :1].expand(-1, count), chance) for _ in range(4))
-    (height, width), canvas = camera.size, Canvas.around(camera, 0.0)
-    xy = torch.stack([u * (width - 1) - canvas.centre[0], v * (height - 1) - canvas.centre[1]], -1) / canvas.focal
-    ray = torch.cat([window.ray, torch.cat([xy, torch.ones_like(xy[..., :1])], -1)], 1)
+    which, when, sign = (_random(window.dt[:, :1].expand(-1, count), chance) for _ in range(3))
+    table = table_of(camera).to(window.ray)
+    ray = torch.cat([window.ray, table[(which * len(table)).long().clamp_max(len(table) - 1)]], 1)
     dt = torch.cat([window.dt, when * window.duration[:, None]], 1)
-    real = (window.polarity != 0).any(1, keepdim=True)  # nothing is added where nothing is
-    polarity = torch.cat([window.polarity, torch.where(sign < 0.5, -1.0, 1.0) * real], 1)
+    added = torch.arange(count, device=window.ray.device) < wanted
+    polarity = torch.cat([window.polarity, torch.where(sign < 0.5, -1.0, 1.0) * added], 1)
     dt, order = dt.sort(stable=True, dim=1)
     parts = ray.gather(1, order[..., None].expand_as(ray)), dt, polarity.gather(1, order), window.start, window.duration
     return replace(sample, window=Window(*parts))
 
 
-def crop(sample: Sample, canvas: Canvas, corner: Tensor, size: tuple[float, float]) -> Sample:
+def crop(sample: Sample, least: Tensor, most: Tensor) -> Sample:
     """Keeps the events in one rectangle of each window; the others become padding.  The camera stays what it is, and so does the truth.
 
-    corner [B, 2] px (x, y) of the canvas | size (height, width) px
+    least, most [B, 2]: of the rays' (x, y), so that a distorted sensor has no part that no rectangle reaches
     """
-    xy = canvas.pixels(sample.window.ray)
-    inside = ((xy >= corner[:, None]) & (xy <= corner[:, None] + corner.new_tensor([size[1], size[0]]))).all(-1)
+    xy = sample.window.ray[..., :2]
+    inside = ((xy >= least[:, None]) & (xy <= most[:, None])).all(-1)
     return replace(sample, window=replace(sample.window, polarity=sample.window.polarity * inside))
 
 
@@ -108,7 +111,8 @@ class Augment:
     """A `transform` of the datasets: all of these by chance, the truth with them.  Works on batches [B, N] too, each window by itself.
 
     camera: whose rectangle noise and crops are of | mirror, upturn, backwards: probabilities | dropout: the largest share of events that is
-    taken away | noise: the largest share that is added | crop: the smallest share of the sensor's height and width that is kept
+    taken away | noise: the largest share that is added | crop: the smallest share of the sensor's height and width that is kept.  How much
+    is taken, added and kept is one number for all windows of a call; where, and whether to mirror, is each window's own.
     """
 
     camera: Camera
@@ -125,18 +129,23 @@ class Augment:
                 raise ValueError(f"{f.name} wants 0 to 1, got {getattr(self, f.name)}")
 
     def __call__(self, sample: Sample, chance: torch.Generator) -> Sample:
-        chances = _random(sample.omega.new_empty(len(sample), 5), chance)
-        sample = flip(sample, chances[:, 0] < self.mirror, 0)
-        sample = flip(sample, chances[:, 1] < self.upturn, 1)
-        sample = reverse(sample, chances[:, 2] < self.backwards)
-        more = torch.rand(3, generator=chance, device=chance.device).tolist()
-        if self.crop < 1:
-            canvas = Canvas.around(self.camera, 0.0)
-            share = self.crop + (1 - self.crop) * more[0]
-            height, width = (share * (n - 1) for n in canvas.size)
-            corner = chances[:, 3:] * chances.new_tensor([canvas.size[1] - 1 - width, canvas.size[0] - 1 - height])
-            sample = crop(sample, canvas, corner, (height, width))
-        return disturb(drop(sample, self.dropout * more[1], chance), self.noise * more[2], self.camera, chance)
+        return augmented(sample, self, chance)
+
+
+@exact
+def augmented(sample: Sample, by: Augment, chance: torch.Generator) -> Sample:
+    """What an `Augment` makes of a sample."""
+    chances = _random(sample.omega.new_empty(len(sample), 5), chance)
+    sample = flip(sample, chances[:, 0] < by.mirror, 0)
+    sample = flip(sample, chances[:, 1] < by.upturn, 1)
+    sample = reverse(sample, chances[:, 2] < by.backwards)
+    more = torch.rand(3, generator=chance, device=chance.device).tolist()
+    if by.crop < 1:
+        table = table_of(by.camera)[:, :2].to(chances)
+        ends, share = table.abs().amax(0), by.crop + (1 - by.crop) * more[0]  # a mirror leaves them as they are
+        least = (2 * chances[:, 3:] * (1 - share) - 1) * ends
+        sample = crop(sample, least, least + 2 * share * ends)
+    return disturb(drop(sample, by.dropout * more[1], chance), by.noise * more[2], by.camera, chance)
 
 
 def _random(like: Tensor, chance: torch.Generator) -> Tensor:

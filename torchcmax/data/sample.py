@@ -14,6 +14,7 @@ from torchcmax.core.model import Displacement
 from torchcmax.core.plane import Plane
 from torchcmax.core.pose import Trajectory
 from torchcmax.core.window import Window
+from torchcmax.data.represent import exact
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Sample:
     window [B, N] | recording [B], event [B] int64: which recording, and which of its events is the window's first, both from 0
     omega [B, 3] rad/s | velocity [B, 3] plane distances/s, 0 where the camera does not move | normal [B, 3], unit, towards the camera
     distance [B] m of the plane | R [B, 3, 3], t [B, 3] m: the camera's pose T_wc at the window's first event
-    All but the integers are of the windows' precision.
+    All but the integers are of the windows' precision.  A window without duration has a pose, but no motion that is known.
     """
 
     window: Window
@@ -42,16 +43,22 @@ class Sample:
     def __getitem__(self, index: slice | Tensor) -> Sample:
         return Sample(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    @property
+    def known(self) -> Tensor:
+        """Which windows have a true motion: [B] bool.  `sample[sample.known]` are those."""
+        return self.omega.isfinite().all(-1) & self.velocity.isfinite().all(-1)
+
     def displacement(self) -> Displacement:
         """The true motion over each window, for `Displacement.homography`, which the representations take."""
         seconds = self.window.duration[:, None]
         return Displacement(self.omega * seconds, self.velocity * seconds, self.normal)
 
+    @exact
     def flow(self, canvas: Canvas, at: float = 0.5) -> Tensor:
         """True optical flow, px over the whole window, of what each pixel of the canvas sees at a time, a share of the window.
 
-        -> [B, 2, H, W].  At the middle, 0.5, it is what `FlowContrastLoss` wants of its flow; at 0 it is the flow of DSEC and MVSEC,
-        from where a point is at the beginning.  A camera that only turns needs no plane.
+        -> [B, 2, H, W], NaN where a pixel does not see the plane.  At the middle, 0.5, it is what `FlowContrastLoss` wants of its flow; at
+        0 it is the flow of DSEC and MVSEC, from where a point is at the beginning.  A camera that only turns needs no plane.
         """
         (height, width), there = canvas.size, self.displacement()
         still = (there.shift == 0).all(-1, keepdim=True)
@@ -59,14 +66,20 @@ class Sample:
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         pixel = torch.stack([x, y], -1).view(-1, 2).to(self.omega)
         ray = torch.cat([(pixel - pixel.new_tensor(canvas.centre)) / canvas.focal, torch.ones_like(pixel[:, :1])], -1)
-        begin, end = (canvas.pixels(_seen_after(there, ray, share - at)) for share in (0.0, 1.0))
-        return (end - begin).mT.reshape(len(self), 2, height, width)
+        rays = [_seen_after(there, ray, share - at) for share in (0.0, 1.0)]
+        begin, end = (canvas.pixels(one) for one in rays)
+        seen = (ray @ there.normal[..., None])[..., 0] < 0
+        seen = (seen | still) & canvas.sees(rays[0]) & canvas.sees(rays[1])
+        return torch.where(seen[..., None], end - begin, torch.nan).mT.reshape(len(self), 2, height, width)
 
-    def to(self, device: torch.device | str, dtype: torch.dtype) -> Sample:
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None, non_blocking: bool = False) -> Sample:
         """The same elsewhere, or in another precision; integers stay what they are."""
-        rest = (getattr(self, f.name) for f in fields(self)[1:])
-        moved = (value.to(device, dtype) if value.is_floating_point() else value.to(device) for value in rest)
-        return Sample(self.window.to(device, dtype), *moved)
+
+        def moved(value: Tensor) -> Tensor:
+            return value.to(device, dtype if value.is_floating_point() else None, non_blocking=non_blocking)
+
+        window = Window(*(moved(getattr(self.window, f.name)) for f in fields(Window)))
+        return Sample(window, *(moved(getattr(self, f.name)) for f in fields(self)[1:]))
 
     def pin_memory(self) -> Sample:
         """In memory that a GPU reads by itself, as a DataLoader with pin_memory=True asks for."""
@@ -86,21 +99,25 @@ def collate(samples: Sequence[Sample]) -> Sample:
     return Sample(window, *(torch.cat([getattr(sample, f.name) for sample in samples]) for f in fields(Sample)[1:]))
 
 
-def labelled(window: Window, recording: int, event: int, truth: Trajectory | None, plane: Plane | None) -> Sample:
-    """One window [1, N] with the truth of its recording, where that covers it."""
+def labelled(window: Window, recording: int, event: int, end: int, truth: Trajectory | None, plane: Plane | None) -> Sample:
+    """One window [1, N] with the truth of its recording, where that covers it.  end: µs, time of its last event."""
     like, number = window.ray, torch.tensor([[recording], [event]])
 
     def unknown(*shape: int) -> Tensor:
         return like.new_full((1, *shape), torch.nan)
 
     found = Sample(window, number[0], number[1], unknown(3), unknown(3), unknown(3), unknown(), unknown(3, 3), unknown(3))
-    end = window.start + (window.duration.double() * 1e6).round().long()
-    if truth is None or window.start < truth.time[0] or end > truth.time[-1]:
+    start = int(window.start)
+    if truth is None or start < truth.time[0] or end > truth.time[-1]:
         return found
-    pose, motion = truth.at(window.start), truth.motion(window.start, window.duration)
-    velocity = torch.where(motion.velocity == 0, 0.0, torch.nan)
-    if plane is not None:
-        seen = plane.seen_from(pose)
-        velocity = motion.velocity / seen.distance[:, None]
+    poses = truth.at(torch.tensor([start, end]))
+    pose = poses[:1]
+    found = replace(found, R=pose.R.to(like), t=pose.t.to(like))
+    seen = None if plane is None else plane.seen_from(pose)
+    if seen is not None:
         found = replace(found, normal=seen.normal.to(like), distance=seen.distance.to(like))
-    return replace(found, omega=motion.omega.to(like), velocity=velocity.to(like), R=pose.R.to(like), t=pose.t.to(like))
+    if end == start:
+        return found
+    step, seconds = pose.inverse() @ poses[1:], (end - start) * 1e-6
+    velocity = torch.where(step.t == 0, 0.0, torch.nan) if seen is None else step.t / seconds / seen.distance[:, None]
+    return replace(found, omega=(so3.log(step.R) / seconds).to(like), velocity=velocity.to(like))

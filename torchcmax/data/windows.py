@@ -6,8 +6,10 @@ import hashlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,31 +30,34 @@ MOST_HELD = 1 << 24  # events of a recording that are held in memory, 220 MB
 
 @dataclass(frozen=True)
 class Source:
-    """What is known of a recording.  number: its place in the dataset | table [H * W, 3] float32: the ray of every pixel."""
+    """What is known of a recording.  number: its place in the dataset."""
 
     number: int
     path: Path
     camera: Camera
-    table: Tensor
     truth: Trajectory | None
     plane: Plane | None
 
     @classmethod
     def of(cls, number: int, recording: Recording) -> Source:
-        table = recording.camera.rays().view(-1, 3).float()
-        return cls(number, recording.path, recording.camera, table, recording.truth, recording.plane)
+        table_of(recording.camera)  # now, so that workers that are forked have it
+        return cls(number, recording.path, recording.camera, recording.truth, recording.plane)
 
-    def sample(self, events: Events, first: int) -> Sample:
-        """A window of events, the first of which has a number; DataError where they are out of order or off the sensor."""
+    def sample(self, events: Events, first: int, before: int = 0) -> Sample:
+        """A window of events, the first of which has a number; `before` more that come before it are looked at for their order.
+
+        DataError where they are out of order or off the sensor.
+        """
         if (late := events.t[1:] < events.t[:-1]).any():
-            place = f"event {first + int(late.argmax()) + 2}"
+            place = f"event {first - before + int(late.argmax()) + 2}"
             remedy = f"convert it, which sorts it: torchcmax convert {self.path} sorted.h5"
             raise DataError(self.path, f"{place} is earlier than the one before it", remedy, place)
+        events = events[before:]
         try:
-            window = Packed.of(events.strided(len(events), 1), self.camera.size).window(self.table)
+            window = Packed.of(events.strided(len(events), 1), self.camera.size).window(table_of(self.camera))
         except ValueError as error:
             raise DataError(self.path, str(error), "give the sensor's true size", f"events {first + 1} to {first + len(events)}") from error
-        return labelled(window, self.number, first, self.truth, self.plane)
+        return labelled(window, self.number, first, int(events.t[-1]), self.truth, self.plane)
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Store:
     @classmethod
     def of(cls, number: int, recording: Recording, cache: Path | None = None) -> Store:
         """A file that can be read anywhere is left where it is; another is converted into the cache, or held in memory."""
-        if recording.pieces is None and cache is not None:
+        if recording.pieces is None and cache is not None and recording.path.exists():
             recording = open(_converted(recording, cache))
         if recording.pieces is not None and recording.count is not None:
             return cls(Source.of(number, recording), recording.count, recording.pieces)
@@ -81,7 +86,14 @@ class Store:
         return (self.count - events) // stride + 1
 
     def sample(self, first: int, events: int) -> Sample:
-        return self.source.sample(self.read(first, first + events), first)
+        before = min(first, 1)
+        return self.source.sample(self.read(first - before, first + events), first, before)
+
+
+@lru_cache(maxsize=16)
+def table_of(camera: Camera) -> Tensor:
+    """The ray of every pixel, [H * W, 3] float32."""
+    return camera.rays().view(-1, 3).float()
 
 
 class _Held:
@@ -126,8 +138,15 @@ class _Windows:
         self.events, self.stride = events, events if stride is None else stride
         if self.events < 2 or self.stride < 1:
             raise ValueError(f"a window wants at least 2 events and a stride of at least 1, got {events}, {stride}")
+        if seed < 0:
+            raise ValueError(f"a seed is at least 0, got {seed}")
         self.transform, self.seed = transform, seed
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that live on see it change
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if not self._epoch.is_shared():  # a copy has its own
+            self._epoch = self._epoch.clone().share_memory_()
 
     def set_epoch(self, epoch: int) -> None:
         """Other augmentations and another order of a stream in every epoch, as of torch's DistributedSampler."""
@@ -223,7 +242,7 @@ class WindowStream(_Windows, IterableDataset[Sample]):
         worker = get_worker_info()
         own, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
         rank, ranks = self.shard
-        part, parts = rank * workers + own, ranks * workers
+        part, parts = own * ranks + rank, ranks * workers
         mine = (self._transformed(sample, number) for number, sample in self._windows(part, parts))
         return _shuffled(mine, self.shuffle, self._chance(part, parts)) if self.shuffle else mine
 

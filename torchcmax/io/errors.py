@@ -10,10 +10,13 @@ from pathlib import Path
 class DataError(Exception):
     """A file that cannot be used as it is: says which, where in it, what is wrong and what to do.  The CLI exits with 1."""
 
-    def __init__(self, path: Path | str, problem: str, remedy: str, place: str = "") -> None:
+    def __init__(self, path: Path | str, problem: str = "", remedy: str = "", place: str = "") -> None:
         self.path, self.place, self.problem, self.remedy = Path(path), place, problem, remedy
         where = f"{path}, {place}" if place else f"{path}"
-        super().__init__(f"{where}: {problem}\n  what to do: {remedy}")
+        super().__init__(f"{where}: {problem}\n  what to do: {remedy}" if problem else where)  # a DataLoader hands on the whole text alone
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[Path, str, str, str]]:
+        return type(self), (self.path, self.problem, self.remedy, self.place)
 
 
 class DataWarning(UserWarning):

@@ -6,8 +6,10 @@ import errno
 import os
 import shutil
 import struct
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +41,7 @@ HEAP, SEARCHED = b"GCOL", 4 << 20  # how a heap of text begins; bytes in which i
 MANY = LARGE // 8  # numbers of a trajectory or an index
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 KEPT = 8 << 20  # bytes of each column that stay unpacked: neighbours are mostly in the same stored piece
+MOST_OPEN = 32  # files that a process keeps open to read pieces of
 BYTES_PER_EVENT, SPARE = 13, 8 << 20  # asked of the disk before each chunk: HDF5 crashes the process when it finds it full
 
 
@@ -202,27 +205,48 @@ def read_events(path: Path, chunk: int, layout: Layout | None = None, start: int
 def _read(path: Path, file: Any, layout: Layout | None, start: int, stop: int) -> Events:
     if layout:
         return read_layout(path, file, layout, start, stop)
-    return as_events(path, {name: file["events"][name][start:stop] for name in NAMES}, start, seconds=False, prefix="events/")
+    return as_events(path, {name: file[f"events/{name}"][start:stop] for name in NAMES}, start, seconds=False, prefix="events/")
 
 
+class _Opened:
+    """A file whose datasets stay open, as what is unpacked of them is forgotten when they are closed."""
+
+    def __init__(self, path: Path) -> None:
+        self.file = h5py.File(path, "r", rdcc_nbytes=KEPT)
+        self.known: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self.known:
+            self.known[name] = self.file[name]
+        return self.known[name]
+
+
+_opened: OrderedDict[tuple[int, Path], _Opened] = OrderedDict()  # by process, as HDF5 does not survive a fork; the latest last
+
+
+@dataclass(frozen=True)
 class Pieces:
-    """The events of a file from one number to another, as they stand there.  Every process, and every copy, opens its own file."""
+    """The events of a file from one number to another, as they stand there.  Every process opens its own file, and keeps some open."""
 
-    def __init__(self, path: Path, layout: Layout | None) -> None:
-        self._path, self._layout = path, layout
-        self._file: Any = None
-        self._process = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None}
+    path: Path
+    layout: Layout | None
 
     def __call__(self, start: int, stop: int) -> Events:
         try:
-            if self._file is None or self._process != os.getpid():  # HDF5 does not survive a fork
-                self._file, self._process = h5py.File(self._path, "r", rdcc_nbytes=KEPT), os.getpid()
-            return _read(self._path, self._file, self._layout, start, stop)
+            return _read(self.path, self._file(), self.layout, start, stop)
         except FAILURES as error:
-            raise DataError(self._path, f"cannot be read as HDF5: {error}", AGAIN) from error
+            remedy = "close other files, or raise the limit: ulimit -n 4096" if "Too many open files" in str(error) else AGAIN
+            raise DataError(self.path, f"cannot be read as HDF5: {error}", remedy) from error
+
+    def _file(self) -> _Opened:
+        key = os.getpid(), self.path
+        if key not in _opened:
+            own = [other for other in _opened if other[0] == key[0]]
+            if len(own) >= MOST_OPEN:
+                _opened.pop(own[0]).file.close()
+            _opened[key] = _Opened(self.path)
+        _opened.move_to_end(key)
+        return _opened[key]
 
 
 def save(recording: Recording, path: Path | str, progress: Callable[[int], object] | None = None) -> None:

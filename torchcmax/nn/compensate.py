@@ -17,6 +17,7 @@ from torchcmax.core.model import MODELS, Displacement, Model, PlanarKnown
 from torchcmax.core.objective import REFERENCES, Look, penalty
 from torchcmax.core.window import Window
 from torchcmax.nn.image import images
+from torchcmax.nn.loss import watched
 
 FLATTEST = 1e-3  # smallest curvature that is divided by, as a share of the largest
 STEP = 0.7  # px of displacement over the window, of central differences
@@ -77,6 +78,9 @@ class Compensate(Module):
     def _found(self, window: Window, weight: Tensor | None, normal: Tensor | None, start: Tensor | None) -> Compensated:
         like, search = window.ray, self.search
         inputs = [part for part in (weight, normal) if part is not None and part.requires_grad]
+        for name, part, wanted in (("weight", weight, window.polarity.shape), ("normal", normal, (len(like), 3))):
+            if part is not None and part.shape != wanted:
+                raise ValueError(f"{name} wants {[*wanted]}, got {[*part.shape]}")
         counted = window if weight is None else replace(window, polarity=window.polarity.to(like) * weight.detach().to(like))
         known = PlanarKnown if self.model == "planar" and normal is not None else MODELS[self.model]
         model = known((self.camera.fx * self.camera.fy) ** 0.5, None if normal is None else normal.detach())
@@ -104,12 +108,15 @@ class Compensate(Module):
         double = window.to(window.ray.device, torch.float64)
         counts = double.polarity if self.look.polarity == "signed" else double.weight
         counts = counts if weight is None else counts * weight
+        some = (counts != 0).any(1)
+        ray = watched(window.to(window.ray.device, torch.float64), counts.detach()[:, None])[0]
+        counts = torch.where(some[:, None], counts, 1.0)
         reference, owner = REFERENCES[self.look.reference], torch.arange(len(x), device=x.device)
         there = (model if normal is None else replace(model, normal=normal)).at_reference(x, owner, reference)
         H_k = there.homography()
         image = images(H_k, double, counts[:, None], reference, Canvas.around(self.camera, self.search.margin))[:, 0]
         contrast = CONTRASTS[self.look.contrast](blur(normalized(image, counts), self.search.blur[-1]))
-        return penalty(self.look, model, there, H_k, double.ray.mT) - contrast.log()
+        return torch.where(some, penalty(self.look, model, there, H_k, ray) - contrast.log(), 0.0)
 
 
 class _Optimum(torch.autograd.Function):
@@ -132,6 +139,8 @@ class _Optimum(torch.autograd.Function):
         steps = STEP * torch.eye(x.shape[1]).to(x)
         rows = [_slope(ctx.value, x + step, weight, normal) - _slope(ctx.value, x - step, weight, normal) for step in steps]
         curvature = torch.stack(rows, 1) / (2 * STEP)
+        decided = curvature.isfinite().all(-1).all(-1) & (curvature != 0).any(-1).any(-1)  # not so of a window without events
+        curvature = torch.where(decided[:, None, None], curvature, torch.eye(x.shape[1]).to(x))
         L, Q = torch.linalg.eigh((curvature + curvature.mT) / 2)
         L = L.clamp_min(FLATTEST * L.abs().amax(-1, keepdim=True)).clamp_min(torch.finfo(L.dtype).tiny)
         along = -(Q @ ((Q.mT @ upstream[..., None]) / L[..., None]))[..., 0]

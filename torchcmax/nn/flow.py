@@ -65,8 +65,8 @@ class FlowContrastLoss(Module):
         if flow.shape != (len(window), 2, *self.canvas.size):
             raise ValueError(f"flow wants [B, 2, H, W] = {[len(window), 2, *self.canvas.size]}, got {[*flow.shape]}")
         with torch.autocast(window.ray.device.type, enabled=False):
-            flow = flow.to(window.ray)
             counts, xy = votes(window, weight, self.polarity), self.canvas.pixels(window.ray)
+            flow = torch.where((counts != 0).flatten(1).any(1)[:, None, None, None], flow.to(window.ray), 0.0)
             moved = sampled(flow, xy)
             total = torch.stack([self._contrast(window, xy, moved, counts, reference) for reference in self.references]).mean(0)
             rest = None

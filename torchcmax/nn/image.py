@@ -26,9 +26,7 @@ def displacement(window: Window, omega: Tensor, velocity: Tensor | None, normal:
     window's first event; without a velocity the camera only turns, without a normal the plane is a wall straight ahead
     """
     like = window.ray
-    for name, vector in (("omega", omega), ("velocity", velocity), ("normal", normal)):
-        if vector is not None and vector.shape != (len(like), 3):
-            raise ValueError(f"{name} wants [B, 3] = [{len(like)}, 3], got {[*vector.shape]}")
+    _check_shapes(len(like), omega, velocity, normal)
     seconds = window.duration[:, None].to(like)
     turn = omega.to(like) * seconds
     facing = torch.zeros_like(turn)
@@ -37,6 +35,26 @@ def displacement(window: Window, omega: Tensor, velocity: Tensor | None, normal:
     if velocity is None:  # a turn is the same in the frame of every moment
         return Displacement(turn, torch.zeros_like(turn), facing)
     return Displacement(turn, velocity.to(like) * seconds, facing).seen_at(reference)
+
+
+def _check_shapes(windows: int, omega: Tensor, velocity: Tensor | None, normal: Tensor | None) -> None:
+    for name, vector in (("omega", omega), ("velocity", velocity), ("normal", normal)):
+        if vector is not None and vector.shape != (windows, 3):
+            raise ValueError(f"{name} wants [B, 3] = [{windows}, 3], got {[*vector.shape]}")
+
+
+def harmless(some: Tensor, omega: Tensor, velocity: Tensor | None, normal: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """The motion, at rest before a wall where a window has no events, some [B], so that what stands there leaves no trace in gradients."""
+    _check_shapes(len(some), omega, velocity, normal)
+    here = some[:, None]
+    wall = None if normal is None else torch.zeros_like(normal)
+    if wall is not None:
+        wall[:, 2] = -1
+    return (
+        torch.where(here, omega, 0.0),
+        None if velocity is None else torch.where(here, velocity, 0.0),
+        None if normal is None or wall is None else torch.where(here, normal, wall),
+    )
 
 
 class Warp(Module):

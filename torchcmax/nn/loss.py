@@ -14,7 +14,7 @@ from torchcmax.core.contrast import CONTRASTS, blur, blur_twin
 from torchcmax.core.objective import ContrastName, deformation
 from torchcmax.core.warp import still
 from torchcmax.core.window import Window
-from torchcmax.nn.image import POLARITIES, Polarity, displacement, images, votes
+from torchcmax.nn.image import POLARITIES, Polarity, displacement, harmless, images, votes
 
 Against = Literal["scattered", "rest", "nothing"]
 Reduction = Literal["mean", "sum", "none"]
@@ -67,15 +67,15 @@ class ContrastLoss(Module):
         """
         with torch.autocast(window.ray.device.type, enabled=False):
             counts, total, cost = votes(window, weight, self.polarity), [], torch.zeros_like(window.ray[:, 0, 0])
+            omega, velocity, normal = harmless((counts != 0).flatten(1).any(1), omega, velocity, normal)
             for reference in self.references:
                 there = displacement(window, omega, velocity, normal, reference)
                 H_k = there.homography()
                 total.append(self._contrast(H_k, window, counts, reference))
                 if velocity is not None and self.guard > 0:
-                    step = max(1, window.ray.shape[1] // WATCHED)
-                    here = window.weight[:, ::step].repeat(1, 2)
-                    excess = deformation(there, H_k, window.ray[:, ::step].mT, reference).abs() - math.log(self.deformation)
-                    cost = cost + self.guard * mean_where(excess.clamp_min(0).square(), here) / len(self.references)
+                    ray, here = watched(window, counts)
+                    excess = deformation(there, H_k, ray, reference).abs() - math.log(self.deformation)
+                    cost = cost + self.guard * mean_where(excess.clamp_min(0).square(), here.repeat(1, 2)) / len(self.references)
             rest = None
             if self.against == "rest":
                 rest = self._contrast(still(H_k.detach()), window, counts, self.references[0])
@@ -128,6 +128,15 @@ def reduced(loss: Tensor, cost: Tensor, counts: Tensor, reduction: str) -> Tenso
     if reduction == "none":
         return whole
     return whole.sum() / (some.sum().clamp_min(1) if reduction == "mean" else 1)
+
+
+def watched(window: Window, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays [B, 3, WATCHED] of events evenly from the first to the last that counts, and whether they do; few are repeated."""
+    some = (counts != 0).any(1)
+    first = some.logical_not().to(torch.uint8).argsort(dim=1, stable=True)  # those that count, in their order, before the others
+    place = torch.arange(WATCHED, device=some.device) * some.sum(1, keepdim=True)
+    index = first.gather(1, place.div(WATCHED, rounding_mode="floor"))
+    return window.ray.gather(1, index[..., None].expand(-1, -1, 3)).mT, some.gather(1, index).to(window.ray)
 
 
 def mean_where(value: Tensor, weight: Tensor) -> Tensor:
