@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -152,6 +153,39 @@ def test_hardware_is_not_moved_unless_armed_or_homed(slider, tmp_path):
             run(slider, program(), tmp_path, simulate=False, arm=True, network=simulation.host)
         assert simulation.drives[0].state is State.DISABLED
         assert o.ENABLE not in simulation.ear.controlwords()
+
+
+def test_hardware_is_run_in_real_time_and_timed_by_when_positions_came(slider, tmp_path):
+    """The same session, paced; one answer is lost on the way, and one SYNC is late."""
+    with rig_on_bus(slider, places=(0.1,)) as simulation:
+        home(slider, tmp_path / "home", simulate=True, network=simulation.host)
+        heard, lost = simulation.host.notify, []
+
+        def lossy(can_id, data, timestamp):
+            if can_id == 0x281 and simulation.drives[0].plant.velocity > 100 and not lost:
+                lost.append(timestamp)
+                return
+            heard(can_id, data, timestamp)
+
+        simulation.host.notify = lossy
+        late = []
+
+        def hold(k):
+            if lost and not late:
+                late.append(k)
+                time.sleep(0.05)
+
+        said = run(slider, program(far=0.05), tmp_path, simulate=False, arm=True, watch=hold, network=simulation.host)
+    assert said["status"] == "complete"
+    rows = np.loadtxt(tmp_path / "encoder.csv", delimiter=",", skiprows=1, usecols=(0, 1, 9))
+    assert (np.diff(rows[:, 0]) == 2).sum() == 1  # the answer that was lost
+    assert rows[:, 1] == pytest.approx(rows[:, 2] - rows[0, 2], abs=2e-6)
+    assert rows[-1, 1] > (rows[-1, 0] - rows[0, 0]) * slider.bus.sync_period + 0.045  # the SYNC that was late
+    encoder = read_encoder(tmp_path / "encoder.csv", slider)
+    assert len(encoder.time) == len(rows) + 1
+    assert (np.diff(encoder.time) > 0).all()
+    assert abs(np.diff(encoder.place[:, 0])).max() < 2e-3
+    assert '"not answered"' in (tmp_path / "log.jsonl").read_text()
 
 
 def test_a_rig_that_is_moved_by_hand_is_recorded_and_never_switched_on(slider, tmp_path):

@@ -126,7 +126,11 @@ def _encoded(rig: Rig, encoder: Encoder, said: dict[str, Any]) -> Encoded:
     from torchcmax.rig.truth import Encoded, repeatability
 
     again = repeatability(rig, encoder.place, _cycles(rig, said))
-    return Encoded(encoder.time, encoder.place, said["status"], bool(said.get("simulated")), again)
+    time, place = encoder.time, encoder.place
+    if not said.get("simulated"):  # a host does not send SYNCs evenly: to even steps of the time at which positions came
+        time = np.linspace(time[0], time[-1], len(time))
+        place = np.stack([np.interp(time, encoder.time, column) for column in place.T], 1)
+    return Encoded(time, place, said["status"], bool(said.get("simulated")), again)
 
 
 def _cycles(rig: Rig, said: dict[str, Any]) -> list[tuple[int, int]]:

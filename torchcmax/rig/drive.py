@@ -41,6 +41,7 @@ class Drive:
         self.told, self.heard = Told(), set[int]()
         self.broken: Exception | None = None
         self.missed = 0  # SYNCs that it has not answered, one after the other
+        self.stamp = 0.0  # s: when its position came, by the interface's clock
         self._parts: dict[int, tuple[int, ...]] = {}
         for pdo in self.pdos:
             if pdo.send:
@@ -57,6 +58,8 @@ class Drive:
             pdo = next(pdo for pdo in self.pdos if pdo.send and pdo.base + self.axis.node_id == can_id)
             self._parts[pdo.number] = pdo.unpack(bytes(data))
             self.heard.add(pdo.number)
+            if o.POSITION in pdo.entries:
+                self.stamp = timestamp
             if len(self.heard) == 3:
                 status = (*self._parts[1], 0)[:3]
                 self.told = Told(*status, *self._parts[2], *self._parts[3])

@@ -23,9 +23,11 @@ RECEIVED = "rx_host_s"  # column of real drives only: simulated ones give the sa
 
 @dataclass(frozen=True)
 class Encoder:
-    """time [K] s on the drives' clock: SYNC's number times its period | place, velocity [K, axes] m, rad and /s | current A, following
+    """time [K] s on the drives' clock | place, velocity [K, axes] m, rad and /s | current A, following
 
-    following: demanded minus actual position, quadcounts | positions are those at the SYNC
+    following: demanded minus actual position, quadcounts | positions are those at the SYNC, one for each, and between its neighbours'
+    where one was not answered.  Times of simulated drives are SYNC's number times its period; those of real ones are when positions came,
+    as a host does not send SYNCs evenly.
     """
 
     time: np.ndarray
@@ -42,18 +44,23 @@ class Recorder:
         self.rig, self.simulated = rig, simulated
         self.every = max(1, round(1 / (rig.rate * rig.bus.sync_period)))
         self.rows: list[str] = []
+        self.first = 0.0  # s of the interface's clock, at which the record begins
         self.events: list[dict[str, Any]] = []
 
-    def take(self, k: int, drives: list[Drive], received: float) -> None:
-        """What was told with SYNC k, which came to the host at `received` s of its clock."""
+    def take(self, k: int, drives: list[Drive]) -> None:
+        """What was told with SYNC k; nothing where a drive did not answer it."""
         if k % self.every:
             return
-        time = k * self.rig.bus.sync_period
+        if not all(drive.complete for drive in drives):
+            self.note(k, "not answered")
+            return
+        self.first = self.first or drives[0].stamp
+        time = k * self.rig.bus.sync_period if self.simulated else drives[0].stamp - self.first
         for drive in drives:
             told, axis = drive.told, drive.axis
             x, v = float(from_quadcounts(axis, told.position)), from_rpm(axis, told.velocity)
             row = f"{k},{time:.6f},{axis.name},{told.position},{x:.9g},{v:.9g},{told.current / 1e3:g},{told.following},{told.statusword}"
-            self.rows.append(row if self.simulated else f"{row},{received:.6f}")
+            self.rows.append(row if self.simulated else f"{row},{drive.stamp:.6f}")
 
     def note(self, k: int, what: str, **more: Any) -> None:
         """An event for the log."""
@@ -99,6 +106,16 @@ def read_encoder(path: Path | str, rig: Rig) -> Encoder:
     if not columns or len(columns) % len(names):
         raise Refused(f"{file}: ends in the middle of a sample\n  what to do: {remedy}")
     table = np.array(columns).reshape(-1, len(names), 8)
-    if not np.isfinite(table).all() or (np.diff(table[:, 0, 0]) <= 0).any():
+    k, time = table[:, 0, 0], table[:, 0, 1]
+    if not np.isfinite(table).all() or (np.diff(k) <= 0).any() or (np.diff(time) <= 0).any():
         raise Refused(f"{file}: its samples are not in order, or not finite\n  what to do: {remedy}")
+    table = _filled(table, np.arange(k[0], k[-1] + 1, max(1, round(1 / (rig.rate * rig.bus.sync_period)))))
     return Encoder(table[:, 0, 1], table[..., 3], table[..., 4], table[..., 5], table[..., 6])
+
+
+def _filled(table: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Samples [K, axes, 8] for every k."""
+    if len(k) == len(table):
+        return table
+    flat = table.reshape(len(table), -1)
+    return np.stack([np.interp(k, table[:, 0, 0], column) for column in flat.T], 1).reshape(len(k), *table.shape[1:])

@@ -104,9 +104,9 @@ class Session:
         for drive in self.drives:
             drive.heard.clear()
         self.network.sync.transmit()
-        received = self._answers()
+        self._answers()
         if self.recording:
-            self.recorder.take(self.k - self.begin, self.drives, received)
+            self.recorder.take(self.k - self.begin, self.drives)
         for drive in self.drives:
             drive.missed = 0 if drive.complete else drive.missed + 1
             if drive.missed * self.period >= max(LOST[0] * self.period, LOST[1]):
@@ -126,12 +126,11 @@ class Session:
         self.next = max(self.next + self.period, now)
         time.sleep(self.next - now)
 
-    def _answers(self) -> float:
-        """Wait for the drives -> s of the host's clock.  Simulated ones have answered already."""
+    def _answers(self) -> None:
+        """Wait for the drives, a period at most.  Simulated ones have answered already."""
         until = time.monotonic() + self.period
         while self.paced and not all(drive.complete for drive in self.drives) and time.monotonic() < until:
             time.sleep(self.period / 20)
-        return time.monotonic()
 
     def _limit(self) -> None:
         """The host's own limits, with some room about those of the drives."""
