@@ -283,3 +283,26 @@ def test_a_quick_stop_is_as_short_as_planned(slider, tmp_path):
     speed = places[0][1] * 0.06 / 4.8 / 6.283185307
     went = (simulation.drives[0].position - places[0][0]) * metres
     assert went <= speed**2 / (2 * slider.axes[0].limits.quick_stop) + 0.002 + 2 * speed * slider.bus.sync_period
+
+
+def test_a_drive_that_is_not_disabled_is_told(slider, tmp_path, monkeypatch):
+    """A run ends well only where every drive says that it is off."""
+    with rig_on_bus(slider) as simulation:
+        (drive,) = simulation.drives
+        control = drive._control
+        monkeypatch.setattr(
+            drive,
+            "_control",
+            lambda word: control(word) if word not in (o.SHUT_DOWN, o.NO_VOLTAGE) or drive.state is not State.ENABLED else None,
+        )
+        with pytest.raises(DriveFault, match=r"axis x.*is not disabled\n.*power"):
+            run(slider, program(far=0.05), tmp_path, simulate=True, network=simulation.host)
+    assert json.loads((tmp_path / "run.json").read_text())["status"].startswith("aborted: ")
+
+
+def test_what_a_drive_said_before_it_fell_silent_is_told(slider, tmp_path):
+    def act(simulation):
+        simulation.drives[0].fault(o.FOLLOWING_ERROR)
+        simulation.drives[0].faults.muted = True
+
+    failing(slider, tmp_path, DriveFault, r"following error \(0x8611\)", act=act, after=400)

@@ -41,11 +41,13 @@ class Drive:
         self.told, self.heard = Told(), set[int]()
         self.broken: Exception | None = None
         self.missed = 0  # SYNCs that it has not answered, one after the other
+        self.emergency = 0  # code of its last emergency message, until it takes that back
         self.stamp = 0.0  # s: when its position came, by the interface's clock
         self._parts: dict[int, tuple[int, ...]] = {}
         for pdo in self.pdos:
             if pdo.send:
                 network.subscribe(pdo.base + axis.node_id, self._on_pdo)
+        self.node.emcy.add_callback(self._on_emergency)
 
     def __str__(self) -> str:
         return f"axis {self.axis.name} (node {self.axis.node_id})"
@@ -65,6 +67,10 @@ class Drive:
                 self.told = Told(*status, *self._parts[2], *self._parts[3])
         except Exception as error:
             self.broken = error
+
+    def _on_emergency(self, message: canopen.emcy.EmcyError) -> None:
+        """Codes below 0x100 say that there is no error any more."""
+        self.emergency = message.code if message.code >= 0x100 else 0
 
     @property
     def complete(self) -> bool:
@@ -153,6 +159,10 @@ class Drive:
                 raise Refused(f"{self}: {obj} was set to {value} and reads {found}\n  what to do: {remedy}")
         return {str(obj): value for obj, value in wanted.items()}
 
+    def unwatch(self) -> None:
+        """Let it not notice the host's silence, which would be its next fault: only for a drive that is disabled."""
+        self.write(o.CONSUMER_HEARTBEAT, 0)
+
     def has(self, obj: Object) -> bool:
         """Whether its firmware has an object that is not wanted of all."""
         if obj not in self.family.optional:
@@ -208,11 +218,12 @@ class Drive:
         self.network.send_message(pdo.base + self.axis.node_id, pdo.pack(*values))
 
     def check(self) -> None:
-        """DriveFault where it is in a fault state."""
+        """DriveFault where it is in a fault state, or has said so before it fell silent."""
         if self.broken is not None:
             raise self.broken
-        if self.state in (State.FAULT, State.FAULTING):
+        if self.state in (State.FAULT, State.FAULTING) or (self.emergency and self.missed):
             axis = self.axis
             where = f"at {self.place:.4f} {'m' if axis.kind == 'linear' else 'rad'}, {self.told.following} quadcounts behind its demand"
-            code = self.told.error or next((entry.code for entry in reversed(self.node.emcy.log) if entry.code), 0)
-            raise DriveFault(f"{self}: {o.error_text(code)}, {where}\n  what to do: remove the cause; then --reset-fault")
+            raise DriveFault(
+                f"{self}: {o.error_text(self.told.error or self.emergency)}, {where}\n  what to do: remove the cause; then --reset-fault"
+            )

@@ -109,10 +109,10 @@ class Session:
             self.recorder.take(self.k - self.begin, self.drives)
         for drive in self.drives:
             drive.missed = 0 if drive.complete else drive.missed + 1
-            if drive.missed * self.period >= max(LOST[0] * self.period, LOST[1]):
-                raise LinkLost(f"{drive}: has not answered {drive.missed} SYNCs\n  what to do: look at its power and cable")
             if not self.stopping:
                 drive.check()
+            if drive.missed * self.period >= max(LOST[0] * self.period, LOST[1]):
+                raise LinkLost(f"{drive}: has not answered {drive.missed} SYNCs\n  what to do: look at its power and cable")
         if self.limited and not self.stopping:
             self._limit()
         if self.k % self.beat == 0:
@@ -181,6 +181,7 @@ class Session:
             drive.write(o.CONTROLWORD, o.RESET)
             if o.state_of(drive.read(o.STATUSWORD)) is State.FAULT:
                 raise DriveFault(f"{drive}: stays in its fault state: {codes}\n  what to do: remove the cause")
+            drive.emergency = 0
 
     def configure(self) -> None:
         """Limits, supervision and PDOs, read back; then the drives listen to PDOs."""
@@ -341,8 +342,16 @@ class Session:
             off = (State.DISABLED, State.FAULT)
             self._while(lambda: not all(drive.state in off for drive in self.drives), 1.0)
             self.recorder.note(self.k, "stopped", states=[str(drive.state and drive.state.value) for drive in self.drives])
-        except (LinkLost, can.CanError) as lost:
-            self._let_go(lost)
+            for drive in self.drives:
+                if drive.state not in off:
+                    raise DriveFault(f"{drive}: is not disabled\n  what to do: take the power from it, then look at log.jsonl")
+                if drive.state is State.DISABLED:
+                    drive.unwatch()
+        except (RigError, can.CanError) as failed:
+            if isinstance(failed, LinkLost | can.CanError):
+                self._let_go(failed)
+            elif failed is not error:
+                self.recorder.note(self.k, "not stopped as it should", reason=str(failed))
             if error is None:
                 raise
 

@@ -26,7 +26,7 @@ from torchcmax.rig.plant import SUBSTEPS, Plant, Ramp
 TYPES = {"i8": objectdictionary.INTEGER8, "u8": objectdictionary.UNSIGNED8, "i16": objectdictionary.INTEGER16,
          "u16": objectdictionary.UNSIGNED16, "i32": objectdictionary.INTEGER32, "u32": objectdictionary.UNSIGNED32}  # fmt: skip
 SYNC, HEARTBEAT = 0x80, 0x700
-OPERATIONAL = 5
+OPERATIONAL, PRE_OPERATIONAL = 5, 127
 NEAR = 4  # quadcounts from its target at which an axis has arrived
 SLOW = 0.5  # rad/s of the motor: stands
 HISTORY = 5  # entries of 0x1003
@@ -192,6 +192,8 @@ class SimulatedDrive:
             self._take_mode(o.MODE.unpack(data))
         elif obj == o.CONTROLWORD:
             self._control(o.CONTROLWORD.unpack(data))
+        elif obj == o.CONSUMER_HEARTBEAT:
+            self.heard = math.nan  # it watches from the first on
 
     def _take_mode(self, mode: int) -> None:
         """Unless it is refused, or there already."""
@@ -330,6 +332,7 @@ class SimulatedDrive:
         if word & o.RESET and not before & o.RESET:
             if self.state is State.FAULT:
                 self.state, self.error = State.DISABLED, 0
+                self.node.emcy.reset()
             return
         if self.state in (State.FAULT, State.FAULTING):
             return
@@ -412,8 +415,11 @@ class SimulatedDrive:
     def _watch(self) -> None:
         """What a drive watches in every period."""
         limit = (self.get(o.CONSUMER_HEARTBEAT) & 0xFFFF) / 1e3
-        if limit and self.time - self.heard > limit + self.period / 2 and self._moves:
+        if limit and self.time - self.heard > limit + self.period / 2:
             self.fault(o.HEARTBEAT_LOST)
+            self.heard = math.nan
+            if self.node.nmt._state == OPERATIONAL:
+                self.node.nmt._state = PRE_OPERATIONAL  # CiA 301: where a node goes that hears nothing any more
         self.plant.blocked = self.faults.blocked_rotor
         if self.faults.heat is not None:
             self.plant.winding = self.faults.heat
