@@ -1,8 +1,8 @@
 """Benchmark tables: scripts/run python scripts/bench.py [--recording REC] [--device cpu] [--json FILE]
 
 (a) one evaluation, ns per event, for each backend; (b) a cold window per motion model; (c) whole recordings; (d) a step of the
-flow's loss, reading files, and windows from a DataLoader; (e) memory; (f) what the device can do at best, measured in the same run.
-Ratios within one run are to be trusted; absolute times depend on the machine and on who else works on it.
+flow's loss, reading files, windows from a DataLoader, and the rig's simulated drives; (e) memory; (f) what the device can do at best,
+measured in the same run.  Ratios within one run are to be trusted; absolute times depend on the machine and on who else works on it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import patch
 
@@ -272,6 +273,27 @@ def loading(folder: Path) -> Table:
     return rows
 
 
+def rigs(folder: Path) -> Table:
+    """SYNCs a second of the example rigs' programs on simulated drives, in lock-step with their motors' physics; real time is `real`."""
+    if find_spec("canopen") is None:
+        return [{"rig": "the extra rig is not installed"}]
+    from torchcmax.rig.config import load
+    from torchcmax.rig.plan import plan
+    from torchcmax.rig.profilefile import load_profile
+    from torchcmax.rig.runner import run
+
+    rows: Table = []
+    configs = Path(__file__).parents[1] / "configs" / "rig"
+    for name, profile in (("slider", "slider_pass"), ("pantilt", "pantilt_sweep")):
+        rig, ticks = load(configs / f"{name}.yaml"), [0]
+        program = plan(rig, load_profile(configs / f"{profile}.yaml", rig)).program
+        begin = time.perf_counter()
+        run(rig, program, folder / name, simulate=True, watch=lambda k, ticks=ticks: ticks.__setitem__(0, k))  # type: ignore[misc]
+        speed = ticks[0] / (time.perf_counter() - begin)
+        rows.append({"rig": name, "axes": len(rig.axes), "SYNC/s": round(speed), "real": round(1 / rig.bus.sync_period)})
+    return rows
+
+
 def limits(recording: Recording, window: Window, device: str) -> Table:
     """(e) Copying, and torch adding to four pixels of an image for each event; and how we compare, reading events twice an evaluation."""
     canvas, model = Canvas.around(recording.camera, 0.0), Planar(recording.camera.fx)
@@ -338,6 +360,7 @@ def tables_of(recordings: list[Recording], folder: Path, windows: int, device: s
     tables["FlowContrastLoss, a step"] = flow_steps(recordings[0], first, device)
     tables["Reading, one core"] = reading(recordings[0], folder)
     tables["Windows at random from a DataLoader"] = loading(folder)
+    tables["Simulated drives, in lock-step"] = rigs(folder)
     tables["Memory"] = memory(recordings[0], device)
     tables["What the device can do"] = limits(recordings[0], first, device)
     return tables
