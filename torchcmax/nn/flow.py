@@ -91,23 +91,17 @@ class FlowContrastLoss(Module):
     def _cost(self, flow: Tensor) -> Tensor:
         """Smoothness and guard: [B]."""
         cost = torch.zeros_like(flow[:, 0, 0, 0])
+        right, down = flow.roll(-1, 3) - flow, flow.roll(-1, 2) - flow  # the last column and row of which mean nothing
         if self.smoothness > 0:
-            (ux, vx), (uy, vy) = _gradient(flow, 1)
-            cost = cost + self.smoothness * ((ux * ux + vx * vx + uy * uy + vy * vy + SOFT**2).sqrt().mean((1, 2)) - SOFT)
-        if self.guard > 0:
-            (ux, vx), (uy, vy) = _gradient(flow, 2)  # side by side, so that every pixel is in one
+            length = ((right.square() + down.square()).sum(1) + SOFT**2).sqrt()
+            cost = cost + self.smoothness * (length[:, :-1, :-1].mean((1, 2)) - SOFT)
+        if self.guard > 0:  # in squares of 2 by 2 pixels side by side, so that every pixel is in one
+            (ux, vx), (uy, vy) = (step[:, :, :-1:2, :-1:2].unbind(1) for step in (right, down))
             trace, area = ux + vy, ux * vy - uy * vx
             for reach in (max(self.references), min(self.references) - 1):  # to the farthest references from both ends of the window
                 excess = (1 + reach * trace + reach**2 * area).clamp_min(SMALLEST).log().abs() - math.log(self.deformation)
                 cost = cost + self.guard / 2 * excess.clamp_min(0).square().mean((1, 2))
         return cost
-
-
-def _gradient(flow: Tensor, step: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Of the flow [B, 2, H, W] to the right and down, in squares of 2 by 2 pixels that begin every `step` pixels: (u, v)_x, (u, v)_y."""
-    here = flow[:, :, :-1:step, :-1:step]
-    right, down = flow[:, :, :-1:step, 1::step], flow[:, :, 1::step, :-1:step]
-    return (right - here).unbind(1), (down - here).unbind(1)
 
 
 def sampled(flow: Tensor, xy: Tensor) -> Tensor:
