@@ -44,6 +44,7 @@ def test_identities_hold_within_rounding_but_for_known_ones(part):
     assert len(found) == 11
     assert outside(motor(part)) == ({("nominal_speed", "n0 - dn/dM M_N")} if part in KNOWN else set())
     assert all(abs(d.relative) < 0.0071 for d in found if not d.outside_rounding)
+    assert next(abs(d.relative) for d in found if d.field == "nominal_current") < (0.005 if part in EC else 0.0011)
 
 
 def test_known_deviations():
@@ -76,17 +77,16 @@ PROTECTED = (
 
 @pytest.mark.parametrize("field", PROTECTED)
 def test_a_wrong_digit_is_noticed(field):
-    """The first or the second digit of any winding, one more or one less."""
+    """The first or the second digit of any winding, one more or one less, brings a deviation that is not a known one."""
     unit, tried = UNITS[field][1], 0
     for part in PARTS:
         m = motor(part)
         printed = getattr(m, field) / unit
         first = 10.0 ** math.floor(math.log10(printed) + 1e-9)
         for step in (first, -first, first / 10, -first / 10):
-            if printed + step > 0:
-                tried += 1
-                assert outside(replace(m, **{field: (printed + step) * unit})) != outside(m), (part, printed, step)
-    assert tried >= 32
+            tried += 1
+            assert outside(replace(m, **{field: (printed + step) * unit})) - outside(m), (part, printed, step)
+    assert tried == 36
 
 
 def test_what_no_identity_protects_is_pinned():
@@ -119,7 +119,7 @@ def test_no_load_and_stall_are_those_printed(part):
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("volts", [12.0, 30.0])
 def test_the_available_speed_is_where_the_voltage_ends(part, volts):
-    m, torque = motor(part), np.linspace(0, 0.04, 5)
+    m, torque = motor(part), np.linspace(-0.04, 0.04, 9)
     speed = available_speed(m, torque, volts, 80.0)
     np.testing.assert_allclose(voltage(m, current(m, torque, speed), speed, 80.0), volts)
 

@@ -126,7 +126,7 @@ def voltage(motor: Motor, current: np.ndarray, speed: np.ndarray, temperature: f
 
 
 def available_speed(motor: Motor, torque: np.ndarray, volts: float, temperature: float = REFERENCE) -> np.ndarray:
-    """rad/s that a torque of at least 0, Nm, can be had at with so many V at the terminals."""
+    """rad/s of at least 0 that a torque, Nm, negative where it brakes, can be had at with so many V at the terminals."""
     R = float(resistance(motor, temperature))
     left = volts - R * np.asarray(torque) / motor.torque_constant
     if motor.commutation == "ec":

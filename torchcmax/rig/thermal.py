@@ -43,15 +43,3 @@ class TwoBody:
             winding, housing = self.step(winding, housing, i, loss, dt)
             found[k] = winding, housing
         return found[:, 0], found[:, 1]
-
-    def steady(self, current: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
-        """Temperatures of winding and housing that a cycle, current [K] A, speed [K] rad/s, comes to for ever; inf where it runs away."""
-        m, loss = self.motor, float(np.mean(no_load_loss(self.motor, speed)))
-        R = float(np.mean(np.square(current))) * m.resistance
-        through = m.housing_ambient + m.winding_housing
-        feedback = R * COPPER * through  # the winding's resistance grows with its temperature
-        if feedback >= 1:
-            return np.inf, np.inf
-        winding = (self.ambient + loss * m.housing_ambient + R * (1 - COPPER * REFERENCE) * through) / (1 - feedback)
-        heat = R * (1 + COPPER * (winding - REFERENCE))
-        return winding, self.ambient + (heat + loss) * m.housing_ambient
