@@ -37,7 +37,8 @@ def test_pdos_carry_what_fits_and_the_controlword_once(family):
     assert [pdo.number for pdo in pdos if o.CONTROLWORD in pdo.entries] == [1]
     assert pdos[0].entries == (o.CONTROLWORD,)
     assert all(pdo.transmission == 1 for pdo in pdos if pdo.send)
-    sent = [sum(entry.size for entry in pdo.entries) for pdo in pdos if pdo.send]
+    assert {entry for pdo in pdos for entry in pdo.entries} <= set(FAMILIES[family].objects)
+    sent = [sum(entry.size for entry in pdo.entries) for pdo in pdos if pdo.send and pdo.entries]
     assert all(ours <= planned for ours, planned in zip(sent, PDOS, strict=True))  # the plan counts with these
     for pdo in pdos:
         values = tuple(-(i + 1) if entry.kind[0] == "i" else i + 1 for i, entry in enumerate(pdo.entries))

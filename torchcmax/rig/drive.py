@@ -45,7 +45,7 @@ class Drive:
         self.stamp = 0.0  # s: when its position came, by the interface's clock
         self._parts: dict[int, tuple[int, ...]] = {}
         for pdo in self.pdos:
-            if pdo.send:
+            if pdo.send and pdo.entries:
                 network.subscribe(pdo.base + axis.node_id, self._on_pdo)
         self.node.emcy.add_callback(self._on_emergency)
 
@@ -153,8 +153,9 @@ class Drive:
             self.write(obj, value)
         for pdo in self.pdos:
             wanted |= self._map(pdo)
+        links = {Object(pdo.communication, 1, "u32") for pdo in self.pdos}
         for obj, value in wanted.items():
-            if (found := self.read(obj)) != value:
+            if ((found := self.read(obj)) ^ value) & ~(o.NO_REMOTE if obj in links else 0):  # of remote frames firmwares say what they like
                 remedy = "look whether the drive's firmware knows the value, or a parameter lock is on"
                 raise Refused(f"{self}: {obj} was set to {value} and reads {found}\n  what to do: {remedy}")
         return {str(obj): value for obj, value in wanted.items()}
@@ -177,11 +178,13 @@ class Drive:
         """Write a PDO's mapping, as CiA 301 wants it: off, emptied, filled, on -> what must then be read."""
         cob_id, kind = Object(pdo.communication, 1, "u32"), Object(pdo.communication, 2, "u8")
         count = Object(pdo.mapping, 0, "u8")
-        here = pdo.base + self.axis.node_id
+        here = pdo.base + self.axis.node_id | (o.NO_REMOTE if pdo.send else 0)
         entries = {
             Object(pdo.mapping, sub, "u32"): entry.index << 16 | entry.sub << 8 | entry.size * 8 for sub, entry in enumerate(pdo.entries, 1)
         }
         self.write(cob_id, here | o.OFF)
+        if not entries:
+            return {cob_id: here | o.OFF}
         self.write(kind, pdo.transmission)
         quiet = {Object(pdo.communication, 3, "u16"): 0} if pdo.send else {}  # EPOS4's inhibit time leaves SYNCs unanswered
         for obj, value in quiet.items():

@@ -17,7 +17,7 @@ Family = Literal["epos2", "epos4"]
 FORMATS = {"i8": "<b", "u8": "<B", "i16": "<h", "u16": "<H", "i32": "<i", "u32": "<I"}
 VENDOR = 0xFB  # maxon motor ag
 MASTER = 0x7F  # node of the host, whose heartbeat the drives watch
-OFF = 1 << 31  # of a COB-ID: the PDO does not exist
+OFF, NO_REMOTE = 1 << 31, 1 << 30  # of a COB-ID: the PDO does not exist; nobody may ask for it by a remote frame
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ TARGET_POSITION = Object(0x607A, 0, "i32")
 LOWEST, HIGHEST = Object(0x607D, 1, "i32"), Object(0x607D, 2, "i32")
 MAX_PROFILE_VELOCITY, PROFILE_VELOCITY = Object(0x607F, 0, "u32"), Object(0x6081, 0, "u32")
 ACCELERATION, DECELERATION, QUICK_STOP = Object(0x6083, 0, "u32"), Object(0x6084, 0, "u32"), Object(0x6085, 0, "u32")
-PROFILE_TYPE = Object(0x6086, 0, "i16")
+PROFILE_TYPE = Object(0x6086, 0, "u16")
 HOMING_METHOD, HOMING_SPEED, HOMING_SLOWLY = Object(0x6098, 0, "i8"), Object(0x6099, 1, "u32"), Object(0x6099, 2, "u32")
 HOMING_ACCELERATION = Object(0x609A, 0, "u32")
 VELOCITY_UNIT = Object(0x60A9, 0, "u32")
@@ -185,6 +185,7 @@ class Pdo:
 def pdos(family: str) -> tuple[Pdo, ...]:
     """The mapping that we want.  The controlword is in one RPDO alone, so that nothing else can send one by accident.
 
+    What a drive would send by itself, its fourth PDO, is off.
     Set points are taken at once, and do nothing until the controlword starts them with a SYNC; mode and target velocity wait for it too.
     """
     return (
@@ -195,6 +196,7 @@ def pdos(family: str) -> tuple[Pdo, ...]:
         Pdo(1, 0x180, True, 1, (STATUSWORD, *FAMILIES[family].status)),
         Pdo(2, 0x280, True, 1, (POSITION, VELOCITY)),
         Pdo(3, 0x380, True, 1, (FAMILIES[family].current, FAMILIES[family].following)),
+        Pdo(4, 0x480, True, 1, ()),
     )
 
 

@@ -11,6 +11,7 @@ from torchcmax.rig.motors import COPPER, REFERENCE
 from torchcmax.rig.thermal import TwoBody
 
 SUBSTEPS = 8  # of the physics, in a period of the SYNC
+STOP = 0.02  # of an axis' way, beyond its limits: where its mechanical ends are
 BANDWIDTH = 2 * math.pi * 25  # rad/s, of the servo
 SLACK = 1e-9  # rad/s: slower is at rest
 
@@ -80,6 +81,8 @@ class Plant:
         self.place, self.velocity, self.current, self.blocked = place, 0.0, 0.0, False
         self.winding = self.housing = ambient
         self.ratio = reduction(axis)
+        room = STOP * (axis.limits.max - axis.limits.min)
+        self.ends = sorted((self.ratio * (axis.limits.min - room), self.ratio * (axis.limits.max + room)))
         self.rotor = axis.motor.inertia + axis.transmission.inertia
         self.inertia = self.rotor + axis.load / self.ratio**2
         self._error = 0.0
@@ -136,6 +139,8 @@ class Plant:
         if before * self.velocity < 0:  # friction stops, and does not turn round
             self.velocity = 0.0
         self.place += (before + self.velocity) / 2 * dt
+        if not self.ends[0] <= self.place <= self.ends[1]:
+            self.place, self.velocity = min(max(self.place, self.ends[0]), self.ends[1]), 0.0
 
     def _acceleration(self, torque: float) -> float:
         """rad/s² that a torque Nm at the motor makes."""

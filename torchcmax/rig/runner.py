@@ -227,9 +227,9 @@ class Session:
         )
 
     def home(self) -> None:
-        """Every axis, one after the other, by its own method."""
-        for i, drive in enumerate(self.drives):
-            self.enable({i: o.HOMING})
+        """Every axis, one after the other, by its own method; the others hold where they stand."""
+        self.enable(dict.fromkeys(range(len(self.drives)), o.HOMING))
+        for drive in self.drives:
             drive.control(o.START)
             self.rest(ANSWER_TIME)  # what it answers before is of an earlier homing
             self.until(lambda d=drive: d.shows(o.ANSWERED) or d.shows(o.OFFSIDE), HOME_TIME, f"{drive}: home was not found")  # type: ignore[misc]

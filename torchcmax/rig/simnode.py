@@ -158,13 +158,14 @@ class SimulatedDrive:
         self.latched: list[tuple[list[Object], bytes]] = []
         self.sent: list[tuple[int, list[Object]]] = []
         self.number = axis.node_id
+        self._delivered = _defaults(axis.family)
         self.node = canopen.LocalNode(axis.node_id, dictionary(axis.family))
         self.node._write_callbacks.clear()  # canopen's would start a thread that sends heartbeats; here they come with the SYNC
         self.node.add_write_callback(self._written)
         self.node.add_read_callback(self._read)
         network.add_node(self.node)
         self.network = network
-        self._by_place = {(obj.index, obj.sub): obj for obj in self.family.objects}
+        self._by_place = {(obj.index, obj.sub): obj for obj in (*self.family.objects, *self._delivered)}
         self.received: dict[int, tuple[int, list[Object]]] = {}
         network.unsubscribe(self.node.sdo.rx_cobid)
         network.subscribe(self.node.sdo.rx_cobid, self._on_sdo)
@@ -177,8 +178,9 @@ class SimulatedDrive:
     # -- its dictionary
 
     def get(self, obj: Object) -> int:
-        """What stands in its dictionary."""
-        return obj.unpack(self.node.get_data(obj.index, obj.sub))
+        """What stands in its dictionary, whatever the host is told."""
+        stored = self.node.data_store.get(obj.index, {}).get(obj.sub)
+        return self._delivered.get(obj, 0) if stored is None else obj.unpack(stored)
 
     def _put(self, obj: Object, value: int) -> None:
         """Without the callbacks, which are for the host."""
@@ -188,12 +190,22 @@ class SimulatedDrive:
         obj = self._by_place.get((index, subindex))
         if obj in self.faults.aborted:
             raise canopen.SdoAbortedError(self.faults.aborted[obj])
+        if 0x1400 <= index < 0x1C00:
+            self._may_map(index, subindex)
         if obj == o.MODE:
             self._take_mode(o.MODE.unpack(data))
         elif obj == o.CONTROLWORD:
             self._control(o.CONTROLWORD.unpack(data))
         elif obj == o.CONSUMER_HEARTBEAT:
             self.heard = math.nan  # it watches from the first on
+
+    def _may_map(self, index: int, sub: int) -> None:
+        """CiA 301: PDOs are mapped while the node is not operational, the PDO is off and, for its entries, empty."""
+        link = Object(index & ~0x200, 1, "u32")
+        if self._operational or not (self.get(link) & o.OFF or (index, sub) == (link.index, 1)):
+            raise canopen.SdoAbortedError(0x08000022)
+        if index != link.index and sub and self.get(Object(index, 0, "u8")):
+            raise canopen.SdoAbortedError(0x06090030)
 
     def _take_mode(self, mode: int) -> None:
         """Unless it is refused, or there already."""
@@ -222,7 +234,8 @@ class SimulatedDrive:
         if obj == self.family.current:
             return round(self.plant.current * 1e3)
         if obj == self.family.following:
-            return self.following
+            most = (1 << 8 * obj.size - 1) - 1
+            return max(-most, min(most, self.following))
         return None
 
     @property
@@ -341,7 +354,7 @@ class SimulatedDrive:
         elif not word & 4:
             self._quick_stop()
         elif not word & 1:
-            self.state = State.READY
+            self.state = self.state if self.state is State.STOPPING else State.READY  # out of a quick stop leads no shutdown
         elif not word & 8:
             self.state = State.SWITCHED_ON if self.state in (State.READY, State.ENABLED, State.SWITCHED_ON) else self.state
         elif self.state in (State.SWITCHED_ON, State.STOPPING):
