@@ -98,8 +98,8 @@ def _keep(out: Path, rig: Rig, planned: Samples | None) -> None:
         write_truth(out, rig, _encoded(rig, encoder, said), None)
     except Refused:  # it ended before there were samples; why is told by whoever ended it
         return
-    write_whole(out / "motion.png", picture.motion(rig, planned, encoder))
     cycles = _cycles(rig, said)
+    write_whole(out / "motion.png", picture.motion(rig, planned, encoder, cycles))
     if len(cycles) > 1:
         write_whole(out / "repeat.png", picture.repeats(rig, encoder, cycles))
 
