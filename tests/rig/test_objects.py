@@ -1,5 +1,7 @@
 """CiA 402 in numbers."""
 
+from dataclasses import replace
+
 import pytest
 
 from torchcmax.rig import objects as o
@@ -59,6 +61,15 @@ def test_units_go_both_ways(slider, pantilt):
             assert o.from_rpm(axis, o.rpm(axis, axis.limits.v / 2)) == pytest.approx(axis.limits.v / 2, rel=1e-3)
             counts = quadcounts(axis, axis.limits.max)
             assert quadcounts(axis, from_quadcounts(axis, counts)) == counts
+
+
+@pytest.mark.parametrize(("method", "end"), [(17, "low"), (18, "high"), (1, "low"), (2, "high"), (-3, "high"), (-4, "low"), (35, None)])
+def test_home_at_an_end_is_at_a_limit(pantilt, method, end):
+    """Of the motor's way: of an axis whose motor is turned around, it is the other of its own."""
+    for axis in pantilt.axes:
+        found = o.settings(replace(axis, homing=replace(axis.homing, method=method)), 0.1)
+        wanted = {"low": found[o.LOWEST] + o.INSIDE, "high": found[o.HIGHEST] - o.INSIDE, None: quadcounts(axis, axis.homing.offset)}
+        assert found[FAMILIES[axis.family].home] == wanted[end]
 
 
 def test_settings_supervise_and_limit(slider, pantilt):

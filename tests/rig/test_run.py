@@ -142,7 +142,21 @@ def test_home_is_found_from_anywhere(slider, tmp_path, place):
         assert drive.homed
         true = drive.plant.place / drive.count
         assert abs(drive.position - true) <= QC  # home is at its place on the axis
+        assert drive.position * 6.25e-6 == pytest.approx(slider.axes[0].homing.offset, abs=QC * 6.25e-6)
         assert drive.state is State.DISABLED
+
+
+@pytest.mark.parametrize("method", [18, 35])
+def test_home_by_other_methods(slider, tmp_path, method):
+    from dataclasses import replace
+
+    axis = slider.axes[0]
+    rig = replace(slider, axes=(replace(axis, homing=replace(axis.homing, method=method, offset=0.7)),))
+    with rig_on_bus(rig) as simulation:
+        home(rig, tmp_path, simulate=True, network=simulation.host)
+        (drive,) = simulation.drives
+        assert drive.position * 6.25e-6 == pytest.approx(0.7, abs=QC * 6.25e-6)
+        assert method == 35 or abs(drive.position - drive.plant.place / drive.count) <= QC
 
 
 def test_a_run_leaves_drives_that_the_next_finds_well(slider, tmp_path):

@@ -17,6 +17,7 @@ Family = Literal["epos2", "epos4"]
 FORMATS = {"i8": "<b", "u8": "<B", "i16": "<h", "u16": "<H", "i32": "<i", "u32": "<I"}
 VENDOR = 0xFB  # maxon motor ag
 MASTER = 0x7F  # node of the host, whose heartbeat the drives watch
+INSIDE = 10  # quadcounts from a soft limit to the home at its end: a switch that was left closes again farther out
 OFF, NO_REMOTE = 1 << 31, 1 << 30  # of a COB-ID: the PDO does not exist; nobody may ask for it by a remote frame
 
 
@@ -234,8 +235,16 @@ def settings(axis: Axis, timeout: float) -> dict[Object, int]:
         HOMING_SPEED: max(1, abs(rpm(axis, axis.homing.speed))),
         HOMING_SLOWLY: max(1, abs(rpm(axis, axis.homing.speed / 5))),
         HOMING_ACCELERATION: abs(rpm(axis, drivable(axis, limits.a))),
-        drive.home: int(quadcounts(axis, axis.homing.offset)),
+        drive.home: {-1: ends[0] + INSIDE, 1: ends[1] - INSIDE}.get(homing_end(axis), int(quadcounts(axis, axis.homing.offset))),
     } | ({} if axis.family == "epos2" else {VELOCITY_UNIT: RPM_UNIT})
+
+
+def homing_end(axis: Axis) -> int:
+    """The end of the motor's way at which the method finds home: -1 or 1; 0 where it is at the offset.
+
+    Switch and stop are where the soft limit is, as there is no way beyond; the axis is brought to the offset afterwards.
+    """
+    return {1: -1, 17: -1, -2: -1, -4: -1, 2: 1, 18: 1, -1: 1, -3: 1}.get(axis.homing.method, 0)
 
 
 def bits(modes: int) -> list[str]:

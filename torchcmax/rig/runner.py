@@ -438,9 +438,15 @@ def home(
     rig: Rig, out: Path, *, simulate: bool, arm: bool = False, reset: bool = False, watch: Watch | None = None,
     network: canopen.Network | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Find home on every axis; arguments and errors as of `run`."""
+    """Find home on every axis, and go to the place that the configuration gives it; arguments and errors as of `run`."""
     _armed(simulate, arm)
-    return _session(rig, out, simulate, {o.HOMING}, reset, watch, network, lambda session, said: session.home())
+
+    def work(session: Session, said: dict[str, Any]) -> None:
+        session.home()
+        session.enable(dict.fromkeys(range(len(rig.axes)), o.PROFILE_POSITION))
+        session.go(tuple(axis.homing.offset for axis in rig.axes))
+
+    return _session(rig, out, simulate, {o.HOMING, o.PROFILE_POSITION}, reset, watch, network, work)
 
 
 def watch_encoders(

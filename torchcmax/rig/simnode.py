@@ -481,10 +481,17 @@ class Simulation:
         self.drives = [SimulatedDrive(drives, rig, axis, x, given.get(axis.name)) for axis, x in zip(rig.axes, places, strict=True)]
 
 
+def _near(axis: Axis) -> float:
+    """A place a tenth of the way from home."""
+    low, high = sorted((axis.limits.min, axis.limits.max), key=lambda x: float(to_motor(axis, x)))
+    home = {-1: low, 1: high}.get(o.homing_end(axis), axis.homing.offset)
+    return home + ((high if home != high else low) - home) / 10
+
+
 @contextmanager
 def simulated(rig: Rig, places: tuple[float, ...] | None = None, faults: dict[str, Faults] | None = None) -> Iterator[Simulation]:
     """The drives of a rig, switched on; by default a tenth of their ways from home, so that it is soon found."""
-    away = tuple(axis.homing.offset + (axis.limits.max - axis.homing.offset) / 10 for axis in rig.axes)
+    away = tuple(_near(axis) for axis in rig.axes)
     made = Simulation(rig, places or away, faults)
     try:
         yield made
