@@ -6,10 +6,12 @@ import pytest
 
 pytest.importorskip("canopen", reason="the extra rig is not installed")
 
+from torchcmax.rig import objects as o
 from torchcmax.rig.program import Move, Program
 from torchcmax.rig.simnode import simulated
 
-CONTROL, SDO = 0x200, 0x600
+EMERGENCY, CONTROL, SDO = 0x80, 0x200, 0x600
+STOPPING, SWITCHING = {o.QUICK, o.NO_VOLTAGE}, {o.SHUT_DOWN, o.SWITCH_ON, o.ENABLE, o.START, o.AT_ONCE}
 
 
 class Ear:
@@ -22,12 +24,29 @@ class Ear:
     def controlwords(self, node=1):
         return [int.from_bytes(data, "little") for can_id, data in self.frames if can_id == CONTROL + node]
 
+    def lawful(self):
+        """No controlword that nobody means, and after a fault of any drive none that switches one on, until it is reset."""
+        faulty = set()
+        for can_id, data in self.frames:
+            kind, node = can_id & 0x780, can_id & 0x7F
+            code = int.from_bytes(data[:2], "little")
+            if kind == EMERGENCY and node:
+                (faulty.add if code >= 0x100 else faulty.discard)(node)
+            elif kind == CONTROL:
+                assert len(data) == 2
+                assert code in (STOPPING if faulty else STOPPING | SWITCHING)
+            elif kind == SDO and data[0] & 0xE0 == 0x20 and data[1:3] == b"\x40\x60":
+                assert data[4] in (0, o.RESET)
+
 
 @contextmanager
-def rig_on_bus(rig, faults=None, places=None):
+def rig_on_bus(rig, faults=None, places=None, lawful=True):
+    """The simulation of a rig; that the host was lawful is asserted in the end."""
     with simulated(rig, places, faults) as simulation:
         simulation.ear = Ear(simulation.line)
         yield simulation
+        if lawful:
+            simulation.ear.lawful()
 
 
 def there_and_back(axis=0, far=0.3, v=0.5, a=5.0):

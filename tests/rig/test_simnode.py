@@ -13,7 +13,7 @@ OPERATE = b"\x01\x01"  # NMT: node 1 becomes operational
 
 @pytest.fixture
 def simulation(slider):
-    with rig_on_bus(slider) as made:
+    with rig_on_bus(slider, lawful=False) as made:
         yield made
 
 

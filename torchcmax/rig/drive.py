@@ -221,10 +221,10 @@ class Drive:
         self.network.send_message(pdo.base + self.axis.node_id, pdo.pack(*values))
 
     def check(self) -> None:
-        """DriveFault where it is in a fault state, or has said so before it fell silent."""
+        """DriveFault where it is in a fault state, or has said so, which it does before it answers a SYNC with that state."""
         if self.broken is not None:
             raise self.broken
-        if self.state in (State.FAULT, State.FAULTING) or (self.emergency and self.missed):
+        if self.state in (State.FAULT, State.FAULTING) or self.emergency:
             axis = self.axis
             where = f"at {self.place:.4f} {'m' if axis.kind == 'linear' else 'rad'}, {self.told.following} quadcounts behind its demand"
             raise DriveFault(
