@@ -9,6 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from torchcmax.rig.checks import _lasting
 from torchcmax.rig.errors import Refused
 from torchcmax.rig.plan import REST, plan
 from torchcmax.rig.profiles import Dwell, Move, Sequence, constant_pass, cruise, sync
@@ -253,3 +254,12 @@ def test_the_summary_is_json_and_tells_the_program(slider):
     assert read["configuration"] == slider.digest
     assert read["program"]["moves"][0]["kind"] == "position"
     assert {"name", "axis", "value", "limit", "unit", "margin", "time", "ok"} == set(read["checks"][0])
+
+
+def test_the_lasting_current_is_that_of_a_filter_that_has_run_for_ever():
+    """y' = (I^2 - y) / tau, as the runner has it while it runs, cycle after cycle."""
+    current, share, mean = np.random.default_rng(0).normal(size=500), 0.004, 0.0
+    found = []
+    for _ in range(30):
+        found = [mean := mean + (i * i - mean) * share for i in current]
+    np.testing.assert_allclose(_lasting(current, share), np.sqrt(found), rtol=1e-12)

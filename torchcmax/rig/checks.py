@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.signal import lfilter
 
 from torchcmax.rig.axis import RPM, quantum
 from torchcmax.rig.config import UNITS, Axis, Rig
@@ -105,7 +106,8 @@ def _motor(rig: Rig, axis: Axis, at: Corners, samples: Samples, k: int) -> list[
     hot = samples.temperature[:, k]
     volts = voltage(motor, amperes, speed, hot.max())
     braking = needed(axis, at.v, -np.sign(at.v) * axis.limits.quick_stop)[2] * (at.v != 0)
-    mean = np.sqrt(np.mean(np.square([samples.current[:-1, k], samples.torque[:-1, k]]), axis=1))
+    mean = np.sqrt(np.mean(np.square(samples.torque[:-1, k])))
+    lasting = _lasting(samples.current[:-1, k], rig.bus.sync_period / motor.winding_time)
     end = samples.time[-1]
     return [
         most("motor's speed", abs(speed) / RPM, motor.max_speed / RPM, "rpm", at.time),
@@ -114,10 +116,21 @@ def _motor(rig: Rig, axis: Axis, at: Corners, samples: Samples, k: int) -> list[
         most("voltage at the hot winding", abs(volts), rig.modulation * rig.supply, "V", at.time),
         most("current", abs(amperes), axis.current_peak, "A", at.time),
         most("current of a quick stop", abs(braking), axis.current_peak, "A", at.time),
-        most("mean current (rms)", mean[0], motor.nominal_current, "A", end),
-        most("mean torque (rms)", mean[1], motor.nominal_torque, "Nm", end),
+        most("mean current (rms)", lasting, motor.nominal_current, "A", samples.time[:-1]),
+        most("mean torque (rms)", mean, motor.nominal_torque, "Nm", end),
         most("winding's temperature", hot, motor.winding_max - COOLER, "°C", samples.time),
     ]
+
+
+def _lasting(current: np.ndarray, share: float) -> np.ndarray:
+    """Root of the mean square of a current [K] over the winding's time constant, of which a sample is a share, cycle after cycle: [K].
+
+    Drives, and the host while it runs, look no farther back.
+    """
+    once, last = lfilter([share], [1, share - 1], np.square(current), zi=[0.0])
+    begin = last[0] / -np.expm1(len(current) * np.log1p(-share)) / (1 - share)  # what the cycles before leave
+    left = begin * (1 - share) ** np.arange(1, len(current) + 1)
+    return np.asarray(np.sqrt(once + left))
 
 
 def _rig(rig: Rig, every: list[Corners], samples: Samples) -> list[Check]:
