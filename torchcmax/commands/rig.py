@@ -142,7 +142,10 @@ def _plan(config: Namespace) -> None:
     plan = _planned(config)
     print(_table(plan))
     if config.out:
-        _write_plan(folder(config.out), config, plan)
+        out = folder(config.out)
+        if (out / "encoder.csv").exists():
+            raise UsageError(f"{out} holds a run: give another folder for the plan")
+        _write_plan(out, config, plan)
     plan.refuse()
 
 
@@ -239,9 +242,9 @@ def _write_plan(out: Path, config: Namespace, plan: Plan) -> None:
 
 
 def _begin(out: Path, config: Namespace) -> None:
-    """A folder with the rig's file, and without what an older run left there of clocks."""
+    """A folder with the rig's file, and without what an older run left there."""
     out.mkdir(parents=True, exist_ok=True)
-    for name in rigtruth.OF_CLOCKS:
+    for name in rigtruth.OF_CLOCKS + rigtruth.OF_RUNS:  # what does not begin leaves nothing that could be taken for its own
         (out / name).unlink(missing_ok=True)
     shutil.copyfile(config.rig, out / rigtruth.LOCK)
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # the extra may be missing
 
 LOCK, CLOCK = "config.lock.yaml", "clock.json"
 OF_CLOCKS = (CLOCK, "groundtruth.txt", "truth.json")
+OF_RUNS = ("encoder.csv", "log.jsonl", "run.json", "groundtruth_driveclock.txt", "twist.txt", "motion.png", "repeat.png")
 BIN = 0.002  # s, in which events are counted
 AWAKE = 0.15  # of the 90 % quantile of events a second: with less, a window is of a camera at rest
 
@@ -49,6 +50,8 @@ def sync(config: Namespace) -> None:
         raise UsageError("give one of --result FOLDER, to align by velocity, and --events RECORDING, to align by the rate of events")
     out = Path(config.run)
     rig, encoded = read_run(out)
+    for name in (*OF_CLOCKS, "twist.txt"):  # of an older clock
+        (out / name).unlink(missing_ok=True)
     driven, turning = _driven(rig, encoded)
     if config.result:
         clock = align(driven, _velocities(Path(config.result), turning), "velocity")
@@ -119,6 +122,8 @@ def _read(out: Path) -> tuple[Rig, Encoder, dict[str, Any]]:
     encoder, said = read_encoder(out / ENCODER, rig), _json(out / RUN)
     if not isinstance(said.get("status"), str) or not isinstance(said.get("cycles"), list):
         raise Refused(f"{out / RUN}: does not say how the run ended\n  what to do: give the folder that rig run wrote")
+    if said.get("configuration") != rig.digest:
+        raise Refused(f"{out / LOCK}: is not the configuration of this run\n  what to do: put back the rig's file that it was run with")
     return rig, encoder, said
 
 
