@@ -171,6 +171,12 @@ class Deviation:
         return self.printed / self.computed - 1
 
 
+def _thermal(highest: float, out: float, through: float, R: float, loss: float) -> float:
+    """The current that holds a winding at its highest temperature for ever, its housing heated by a loss, W."""
+    return math.sqrt((highest - REFERENCE - loss * out) / ((out + through) * R * (1 + COPPER * (highest - REFERENCE))))
+
+
+THERMAL = "winding_max housing_ambient winding_housing resistance torque_constant no_load_current nominal_speed"
 Formula = Callable[..., float]
 IDENTITIES: list[tuple[str, str, str, str, Formula]] = [
     # of both kinds, or of one: the field, how it reads, the fields it is made of
@@ -187,9 +193,12 @@ IDENTITIES: list[tuple[str, str, str, str, Formula]] = [
     ("nominal_current", "M_N / kM + I0", "dc", "nominal_torque torque_constant no_load_current", lambda m, k, i: m / k + i),
     ("nominal_current", "M_N / kM + I0 n_N / n0", "ec", "nominal_torque torque_constant no_load_current nominal_speed no_load_speed",
      lambda m, k, i, n, n0: m / k + i * n / n0),
+    ("nominal_current", "that of T_max at n_N", "dc", THERMAL, lambda T, a, h, r, k, i, n: _thermal(T, a, h, r, k * i * n)),
+    ("nominal_current", "that of T_max at n_N", "ec", f"{THERMAL} no_load_speed",
+     lambda T, a, h, r, k, i, n, n0: _thermal(T, a, h, r, k * i * n * n / n0)),
     ("nominal_speed", "n0 - dn/dM M_N", "ec dc", "no_load_speed gradient nominal_torque", lambda n0, g, m: n0 - g * m),
 ]  # fmt: skip
-EXACT = ("voltage",)
+EXACT = ("voltage", "winding_max")  # are no measurements
 
 
 def verify(motor: Motor) -> list[Deviation]:
