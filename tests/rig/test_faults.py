@@ -5,63 +5,14 @@ import signal
 from dataclasses import replace
 
 import pytest
-from bus import CONTROL, program, rig_on_bus, sync
+from bus import CONTROL, failing, marked, never_enabled_after, program, rig_on_bus, stands
 
 from torchcmax.rig import objects as o
-from torchcmax.rig.axis import reduction
-from torchcmax.rig.errors import Aborted, DriveFault, LinkLost, Refused, RigError
+from torchcmax.rig.errors import Aborted, DriveFault, LinkLost, Refused
 from torchcmax.rig.objects import State
 from torchcmax.rig.program import Move, Program
 from torchcmax.rig.runner import run
 from torchcmax.rig.simnode import Faults
-
-
-def failing(rig, out, error, match, faults=None, told=None, act=None, after=0):
-    """A run in which something happens while the first axis moves fast: the simulation as it was left.
-
-    faults: from the beginning | act: simulation -> None, done once | after: SYNCs that still come
-    """
-    out.mkdir(exist_ok=True)
-    (out / "groundtruth.txt").write_text("of an older run\n")
-    done = []
-    told = told or program()
-    fast = 0.6 * told.moves[0].v * abs(reduction(rig.axes[0]))  # rad/s of the motor: in the middle of a move
-    with rig_on_bus(rig, {rig.axes[0].name: faults} if faults else None) as simulation:
-        drive = simulation.drives[0]
-
-        def watch(k):
-            if act is not None and not done and abs(drive.plant.velocity) > fast and drive.mode == o.PROFILE_POSITION:
-                done.append(k)
-                act(simulation)
-
-        with pytest.raises(error, match=match) as caught:
-            run(rig, told, out, simulate=True, watch=watch, network=simulation.host)
-        assert act is None or done
-        assert not (out / "groundtruth.txt").exists()
-        assert json.loads((out / "run.json").read_text())["status"].startswith("aborted: ")
-        assert not list(out.glob(".*"))
-        if isinstance(caught.value, RigError):
-            assert "what to do" in str(caught.value) or isinstance(caught.value, Aborted)
-        simulation.caught = caught.value
-        sync(simulation, after)
-        return simulation
-
-
-def stands(simulation, states=(State.DISABLED, State.FAULT)):
-    for drive in simulation.drives:
-        assert drive.state in states
-        assert abs(drive.plant.velocity) < 1
-        assert drive.plant.current == 0
-
-
-def never_enabled_after(simulation, before):
-    """No controlword but quick stop and no voltage came after a frame."""
-    later = [int.from_bytes(data, "little") for can_id, data in simulation.ear.frames[before:] if can_id & 0x780 == CONTROL]
-    assert set(later) <= {o.QUICK, o.NO_VOLTAGE}
-
-
-def marked(simulation):
-    simulation.mark = len(simulation.ear.frames)
 
 
 def set_fault(name, value):
@@ -110,11 +61,19 @@ def test_the_other_axes_stop_too(pantilt, tmp_path):
 
 
 def test_a_soft_limit_is_the_end(slider, tmp_path):
-    """A program that no plan would accept: the drive stops at its own limit."""
+    """A program that no plan would accept: the host stops before the limit is reached."""
     beyond = Program((Move(0.0, 0, "position", 0.9, 0.5, 5.0),), (0.1,), 3.0)
-    simulation = failing(slider, tmp_path, DriveFault, r"soft limit|outside of", told=beyond)
+    simulation = failing(slider, tmp_path, DriveFault, r"is at 0\.7\d+ and too fast to stop between -0.02 and 0.75", told=beyond)
     stands(simulation)
-    assert simulation.drives[0].plant.place * 0.06 / 4.8 / 6.283185307 < slider.axes[0].limits.max + 0.02
+    assert simulation.drives[0].plant.place * 0.06 / 4.8 / 6.283185307 < slider.axes[0].limits.max + 0.003
+
+
+def test_a_drive_knows_its_soft_limit_itself(slider, tmp_path, monkeypatch):
+    """Were the host's limits not there."""
+    monkeypatch.setattr("torchcmax.rig.session.Session._limit", lambda self: None)
+    beyond = Program((Move(0.0, 0, "position", 0.9, 0.5, 5.0),), (0.1,), 3.0)
+    simulation = failing(slider, tmp_path, DriveFault, r"axis x.*soft limit of the position \(0x8A82\)", told=beyond)
+    stands(simulation)
 
 
 def test_the_host_has_limits_too(slider, tmp_path):
@@ -128,11 +87,11 @@ def test_the_host_has_limits_too(slider, tmp_path):
     ("model", "match"), [("warm", r"winding of 1\d\d °C by the model"), ("load", r"takes 99\.\d+ A, more than the 2.66 A")]
 )
 def test_the_host_counts_heat_and_current(slider, tmp_path, monkeypatch, model, match):
-    from torchcmax.rig import runner
+    from torchcmax.rig import session
 
     sessions = []
-    begun = runner.Session.__enter__
-    monkeypatch.setattr(runner.Session, "__enter__", lambda self: sessions.append(self) or begun(self))
+    begun = session.Session.__enter__
+    monkeypatch.setattr(session.Session, "__enter__", lambda self: sessions.append(self) or begun(self))
     values = {"warm": (154.0, 100.0), "load": 99.0**2 + 40}
     act = lambda simulation: getattr(sessions[0], model).__setitem__(0, values[model])  # noqa: E731
     stands(failing(slider, tmp_path, DriveFault, match, act=act))

@@ -10,6 +10,7 @@ import pytest
 from bus import program, rig_on_bus, sync
 
 from torchcmax.rig import objects as o
+from torchcmax.rig import session
 from torchcmax.rig.config import load
 from torchcmax.rig.errors import DriveFault, Refused
 from torchcmax.rig.objects import State
@@ -180,8 +181,9 @@ def test_hardware_is_not_moved_unless_armed_or_homed(slider, tmp_path):
         assert o.ENABLE not in simulation.ear.controlwords()
 
 
-def test_hardware_is_run_in_real_time_and_timed_by_when_positions_came(slider, tmp_path):
-    """The same session, paced; one answer is lost on the way, and one SYNC is late."""
+def test_hardware_is_run_in_real_time_and_timed_by_when_positions_came(slider, tmp_path, monkeypatch):
+    """The same session, paced; one answer is lost on the way, and some SYNCs cannot be sent in time."""
+    monkeypatch.setattr(session, "STALL", 1.0)  # of a machine that is not this test's alone
     with rig_on_bus(slider, places=(0.1,)) as simulation:
         home(slider, tmp_path / "home", simulate=True, network=simulation.host)
         heard, lost = simulation.host.notify, []
@@ -196,18 +198,23 @@ def test_hardware_is_run_in_real_time_and_timed_by_when_positions_came(slider, t
         late = []
 
         def hold(k):
-            if lost and not late:
+            if lost:
                 late.append(k)
-                time.sleep(0.05)
+            if len(late) == 20:
+                time.sleep(0.03)
 
         said = run(slider, program(far=0.05), tmp_path, simulate=False, arm=True, watch=hold, network=simulation.host)
     assert said["status"] == "complete"
     rows = np.loadtxt(tmp_path / "encoder.csv", delimiter=",", skiprows=1, usecols=(0, 1, 9))
-    assert (np.diff(rows[:, 0]) == 2).sum() == 1  # the answer that was lost
+    assert said["unanswered"] == {"x": 1}
+    steps = np.diff(rows[:, 0])
+    assert steps.max() >= 25  # what could not be sent in time is left out
+    assert said["syncs"]["left_out"] >= steps.max() - 1
     assert rows[:, 1] == pytest.approx(rows[:, 2] - rows[0, 2], abs=2e-6)
-    assert rows[-1, 1] > (rows[-1, 0] - rows[0, 0]) * slider.bus.sync_period + 0.045  # the SYNC that was late
+    apart = rows[:, 1] - (rows[:, 0] - rows[0, 0]) * slider.bus.sync_period
+    assert abs(np.median(apart[-100:]) - np.median(apart[:100])) < 0.01  # so that SYNCs go on to count time
     encoder = read_encoder(tmp_path / "encoder.csv", slider)
-    assert len(encoder.time) == len(rows) + 1
+    assert len(encoder.time) == rows[-1, 0] - rows[0, 0] + 1
     assert (np.diff(encoder.time) > 0).all()
     assert abs(np.diff(encoder.place[:, 0])).max() < 2e-3
     assert '"not answered"' in (tmp_path / "log.jsonl").read_text()

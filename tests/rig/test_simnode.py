@@ -19,7 +19,7 @@ def simulation(slider):
 
 @pytest.fixture
 def host(simulation, slider):
-    made = Drive(simulation.host, slider.axes[0])
+    made = Drive(simulation.host, slider.axes[0], slider.bus.sync_period)
     made.configure(0.1)
     return made
 

@@ -6,8 +6,12 @@ asked for (with a mode; after a reset), and swallows what goes wrong.
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
+import can
 import canopen
 
 from torchcmax.rig import objects as o
@@ -17,9 +21,23 @@ from torchcmax.rig.errors import DriveFault, LinkLost, Refused, RigError
 from torchcmax.rig.objects import FAMILIES, Object, Pdo, State
 from torchcmax.rig.program import Move
 
+GONE = (can.CanError, OSError, RuntimeError)  # python-can's errors, those of adapters that were unplugged, and canopen's of no connection
+STEADY = 2  # quadcounts by which an axis that stands may still waver
+STANDS = 2.0  # rpm of the motor
+
+
+@contextmanager
+def bus() -> Iterator[None]:
+    """LinkLost for what sending raises when the bus is off, its queue full, or its interface gone."""
+    try:
+        yield
+    except GONE as error:
+        remedy = "look at the interface (ip -details link show), cable and termination"
+        raise LinkLost(f"the bus is gone: {str(error) or type(error).__name__}\n  what to do: {remedy}") from error
+
 
 class Told(NamedTuple):
-    """What a drive told with a SYNC, in its units: quadcounts, rpm, mA."""
+    """What a drive told with a SYNC, in its units: quadcounts, rpm, mA.  stamp: s by the interface's clock, when its position came."""
 
     statusword: int = 0
     mode: int = 0
@@ -28,26 +46,39 @@ class Told(NamedTuple):
     velocity: int = 0
     current: int = 0
     following: int = 0
+    stamp: float = 0.0
 
 
 class Drive:
-    """The drive of an axis on a network.  heard: which of its PDOs came since the last SYNC; broken: what went wrong while they came."""
+    """The drive of an axis on a network, and what it answers to SYNCs, one every `period` s.
 
-    def __init__(self, network: canopen.Network, axis: Axis) -> None:
+    complete: whether it answered the last SYNC | missed: SYNCs that it has not answered, one after the other, and unanswered: in all
+    steady: SYNCs for which its position has not changed | emergency: code of its last emergency message, until it takes that back
+    broken: what went wrong while an answer was received
+    """
+
+    def __init__(self, network: canopen.Network, axis: Axis, period: float) -> None:
+        self.slow = max(STANDS, o.speed_step(axis, period))  # rpm, that a motor at rest may be told to have
         self.axis, self.family, self.network = axis, FAMILIES[axis.family], network
         self.node = canopen.RemoteNode(axis.node_id, canopen.ObjectDictionary())
         network.add_node(self.node)
         self.pdos = o.pdos(axis.family)
-        self.told, self.heard = Told(), set[int]()
+        self.told, self.complete = Told(), False
+        self.missed = self.unanswered = self.steady = self.emergency = 0
         self.broken: Exception | None = None
-        self.missed = 0  # SYNCs that it has not answered, one after the other
-        self.emergency = 0  # code of its last emergency message, until it takes that back
-        self.stamp = 0.0  # s: when its position came, by the interface's clock
+        self._stands = 0  # quadcounts, about which it wavers
         self._parts: dict[int, tuple[int, ...]] = {}
-        for pdo in self.pdos:
-            if pdo.send and pdo.entries:
-                network.subscribe(pdo.base + axis.node_id, self._on_pdo)
+        self._stamp = 0.0
+        self._tells = {pdo.base + axis.node_id: pdo for pdo in self.pdos if pdo.send and pdo.entries}
+        for cob_id in self._tells:
+            network.subscribe(cob_id, self._on_pdo)
         self.node.emcy.add_callback(self._on_emergency)
+
+    def close(self) -> None:
+        """It is heard no more."""
+        for cob_id in self._tells:
+            self.network.unsubscribe(cob_id, self._on_pdo)
+        del self.network[self.axis.node_id]
 
     def __str__(self) -> str:
         return f"axis {self.axis.name} (node {self.axis.node_id})"
@@ -55,16 +86,25 @@ class Drive:
     # -- what it tells
 
     def _on_pdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """In the thread that receives: may not raise, as canopen would only log that."""
+        """In the thread that receives: may not raise, as canopen would only log that.
+
+        An answer begins with the first PDO, which goes first over the bus: what comes without it belongs to the SYNC before.
+        """
         try:
-            pdo = next(pdo for pdo in self.pdos if pdo.send and pdo.base + self.axis.node_id == can_id)
-            self._parts[pdo.number] = pdo.unpack(bytes(data))
-            self.heard.add(pdo.number)
+            pdo = self._tells[can_id]
+            values = pdo.unpack(bytes(data))
+            if pdo.number == 1:
+                self._parts = {}
+            parts = self._parts
+            if pdo.number != 1 and 1 not in parts:
+                return
+            parts[pdo.number] = values
             if o.POSITION in pdo.entries:
-                self.stamp = timestamp
-            if len(self.heard) == 3:
-                status = (*self._parts[1], 0)[:3]
-                self.told = Told(*status, *self._parts[2], *self._parts[3])
+                self._stamp = timestamp
+            if len(parts) == len(self._tells):
+                word, mode, error = (*parts[1], 0)[:3]
+                (place, speed), (current, following) = parts[2], parts[3]
+                self.told, self.complete = Told(word, mode, error, place, speed, current, following, self._stamp), True
         except Exception as error:
             self.broken = error
 
@@ -72,14 +112,34 @@ class Drive:
         """Codes below 0x100 say that there is no error any more."""
         self.emergency = message.code if message.code >= 0x100 else 0
 
-    @property
-    def complete(self) -> bool:
-        """Whether it answered the last SYNC."""
-        return len(self.heard) == 3
+    def expect(self) -> None:
+        """What it tells from now on is its answer to the next SYNC."""
+        self._parts, self.complete = {}, False
+
+    def count(self) -> None:
+        """Whether it has answered, and whether it stands."""
+        if not self.complete:
+            self.missed += 1
+            self.unanswered += 1
+            return
+        self.missed = 0
+        self.steady += 1
+        if abs(self.told.position - self._stands) > STEADY:
+            self._stands, self.steady = self.told.position, 0
+
+    def forget(self) -> None:
+        """Whatever came before its PDOs were mapped."""
+        self.expect()
+        self.broken, self.missed, self.unanswered = None, 0, 0
 
     @property
     def state(self) -> State | None:
         return o.state_of(self.told.statusword)
+
+    @property
+    def says(self) -> str:
+        """Its state in words."""
+        return "in a state that is unknown" if self.state is None else self.state.value
 
     def shows(self, bit: int) -> bool:
         return bool(self.told.statusword & bit)
@@ -94,24 +154,29 @@ class Drive:
         """m/s or rad/s."""
         return o.from_rpm(self.axis, self.told.velocity)
 
+    def arrived(self, move: Move | None) -> bool:
+        """Whether it says so, is no faster than its encoder tells from rest within a SYNC, and is where a move should have brought it."""
+        there = move is None or move.kind == "velocity" or abs(self.place - move.target) <= self.axis.limits.following
+        return self.shows(o.ARRIVED) and abs(self.told.velocity) <= self.slow and there
+
     # -- its dictionary
 
     def read(self, obj: Object) -> int:
         """By SDO; Refused where the drive refuses, LinkLost where it does not answer."""
         try:
             return obj.unpack(self.node.sdo.upload(obj.index, obj.sub))
-        except Exception as error:
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, struct.error, *GONE) as error:
             raise self._failed(f"{obj} cannot be read", error) from error
 
     def write(self, obj: Object, value: int) -> None:
         """By SDO; errors as of `read`."""
         try:
             self.node.sdo.download(obj.index, obj.sub, obj.pack(value))
-        except Exception as error:
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, struct.error, *GONE) as error:
             raise self._failed(f"{obj} cannot be set to {value}", error) from error
 
     def _failed(self, what: str, error: Exception) -> RigError:
-        if isinstance(error, canopen.SdoAbortedError):
+        if isinstance(error, canopen.SdoAbortedError | struct.error):
             return Refused(f"{self}: {what}: {error}\n  what to do: compare family and firmware with the configuration")
         remedy = "look at power, cable, termination, bit rate and node id"
         return LinkLost(f"{self}: {what}: {str(error) or type(error).__name__}\n  what to do: {remedy}")
@@ -160,6 +225,21 @@ class Drive:
                 raise Refused(f"{self}: {obj} was set to {value} and reads {found}\n  what to do: {remedy}")
         return {str(obj): value for obj, value in wanted.items()}
 
+    def believed(self) -> None:
+        """Refused where its home was found under another configuration, by which places were elsewhere."""
+        if not self.read(o.STATUSWORD) & o.HOMED:
+            return
+        wanted = o.settings(self.axis, 0.0)
+        for obj in (self.family.home, o.HOMING_METHOD, o.LOWEST, o.HIGHEST):
+            if (found := self.read(obj)) != wanted[obj]:
+                what = f"its home was not found under this configuration: {obj} is {found}, not {wanted[obj]}"
+                raise Refused(f"{self}: {what}\n  what to do: torchcmax rig home")
+
+    def home_is(self, known: bool) -> None:
+        """While home is being looked for the upper soft limit is another, by which `believed` sees a search that was not finished."""
+        highest = o.settings(self.axis, 0.0)[o.HIGHEST]
+        self.write(o.HIGHEST, highest if known else highest - 1)
+
     def unwatch(self) -> None:
         """Let it not notice the host's silence, which would be its next fault: only for a drive that is disabled."""
         self.write(o.CONSUMER_HEARTBEAT, 0)
@@ -205,10 +285,10 @@ class Drive:
     def aim(self, move: Move) -> None:
         """The set point of a move, which starts with a controlword, or at the next SYNC where it is one of velocity."""
         axis = self.axis
-        v, a = o.rpm(axis, move.v), abs(o.rpm(axis, move.a))
+        v, a = o.rpm(axis, move.v), max(1, abs(o.rpm(axis, move.a)))
         self._send(3, a, a)
         if move.kind == "position":
-            self._send(2, int(quadcounts(axis, move.target)), abs(v))
+            self._send(2, int(quadcounts(axis, move.target)), max(1, abs(v)))
         else:
             self.turn(o.PROFILE_VELOCITY_MODE, v)
 
@@ -218,7 +298,8 @@ class Drive:
 
     def _send(self, number: int, *values: int) -> None:
         pdo = next(pdo for pdo in self.pdos if not pdo.send and pdo.number == number)
-        self.network.send_message(pdo.base + self.axis.node_id, pdo.pack(*values))
+        with bus():
+            self.network.send_message(pdo.base + self.axis.node_id, pdo.pack(*values))
 
     def check(self) -> None:
         """DriveFault where it is in a fault state, or has said so, which it does before it answers a SYNC with that state."""

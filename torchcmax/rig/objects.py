@@ -73,6 +73,7 @@ OBJECTS = [value for value in globals().values() if isinstance(value, Object)]
 class Drive:
     """What differs between families.  nominal_current mA, peak_current mA, thermal_time 0.1 s, max_speed rpm, home: its position, qc
 
+    home_move: qc, by which an axis would still move away from where it found home
     status: what is told beside the statusword; an EPOS2 tells errors by emergency messages alone
     optional: settings that not every firmware has
     """
@@ -86,6 +87,7 @@ class Drive:
     thermal_time: Object
     max_speed: Object
     home: Object
+    home_move: Object
     soft_limit: int
     limit_switch: int
     status: tuple[Object, ...]
@@ -99,11 +101,11 @@ class Drive:
 
 FAMILIES: dict[str, Drive] = {
     "epos4": Drive("EPOS4", Object(0x30D1, 2, "i32"), Object(0x60F4, 0, "i32"), Object(0x3001, 1, "u32"), Object(0x3001, 2, "u32"),
-                   Object(0x3001, 3, "u8"), Object(0x3001, 4, "u16"), Object(0x6080, 0, "u32"), Object(0x30B0, 0, "i32"), 0x8A82, 0x8A80,
-                   (MODE_SHOWN, ERROR_CODE), ()),
+                   Object(0x3001, 3, "u8"), Object(0x3001, 4, "u16"), Object(0x6080, 0, "u32"), Object(0x30B0, 0, "i32"),
+                   Object(0x30B1, 0, "i32"), 0x8A82, 0x8A80, (MODE_SHOWN, ERROR_CODE), ()),
     "epos2": Drive("EPOS2", Object(0x6078, 0, "i16"), Object(0x20F4, 0, "i16"), Object(0x6410, 1, "u16"), Object(0x6410, 2, "u16"),
-                   Object(0x6410, 3, "u8"), Object(0x6410, 5, "u16"), Object(0x6410, 4, "u32"), Object(0x2081, 0, "i32"), 0xFF09, 0xFF06,
-                   (MODE_SHOWN,), (ABORT_OPTION, QUICK_STOP_OPTION, FAULT_OPTION)),
+                   Object(0x6410, 3, "u8"), Object(0x6410, 5, "u16"), Object(0x6410, 4, "u32"), Object(0x2081, 0, "i32"),
+                   Object(0x607C, 0, "i32"), 0xFF09, 0xFF06, (MODE_SHOWN,), (ABORT_OPTION, QUICK_STOP_OPTION, FAULT_OPTION)),
 }  # fmt: skip
 
 PROFILE_POSITION, PROFILE_VELOCITY_MODE, HOMING = 1, 3, 6
@@ -120,6 +122,8 @@ ERRORS = {
 
 def error_text(code: int) -> str:
     """In words; of the firmware's other codes only the number."""
+    if not code:
+        return "a fault whose code was not heard: log.jsonl has the drive's history"
     return f"{ERRORS.get(code, 'see the firmware specification of the drive')} (0x{code:04X})"
 
 
@@ -210,6 +214,11 @@ def from_rpm(axis: Axis, value: float) -> float:
     return value * RPM / reduction(axis)
 
 
+def speed_step(axis: Axis, period: float) -> float:
+    """rpm that a motor seems to turn by where its encoder counts one quadcount in a period, s."""
+    return 60 / (4 * axis.cpt * period)
+
+
 def settings(axis: Axis, timeout: float) -> dict[Object, int]:
     """What is written into a drive before it may move, and read back.  timeout: s without the host's heartbeat after which it stops."""
     drive, motor, limits = FAMILIES[axis.family], axis.motor, axis.limits
@@ -236,7 +245,8 @@ def settings(axis: Axis, timeout: float) -> dict[Object, int]:
         HOMING_SLOWLY: max(1, abs(rpm(axis, axis.homing.speed / 5))),
         HOMING_ACCELERATION: abs(rpm(axis, drivable(axis, limits.a))),
         drive.home: {-1: ends[0] + INSIDE, 1: ends[1] - INSIDE}.get(homing_end(axis), int(quadcounts(axis, axis.homing.offset))),
-    } | ({} if axis.family == "epos2" else {VELOCITY_UNIT: RPM_UNIT})
+        drive.home_move: 0,
+    }
 
 
 def homing_end(axis: Axis) -> int:

@@ -4,30 +4,39 @@ from __future__ import annotations
 
 import json
 import os
+import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from torchcmax.rig.axis import from_quadcounts
 from torchcmax.rig.config import Rig
-from torchcmax.rig.drive import Drive
-from torchcmax.rig.errors import Refused
+from torchcmax.rig.errors import Refused, RigError
 from torchcmax.rig.objects import from_rpm
+
+if TYPE_CHECKING:  # what reads records needs no bus
+    from torchcmax.rig.drive import Drive
 
 ENCODER, LOG, RUN = "encoder.csv", "log.jsonl", "run.json"
 COLUMNS = "k,t_drive_s,axis,pos_qc,x,v,current_a,following_qc,statusword"
 RECEIVED = "rx_host_s"  # column of real drives only: simulated ones give the same file every time
+LAST = 200  # samples that run.json tells of a run that was aborted
+STEP = 0.1  # s by which the interface's clock may not jump against the host's
 
 
 @dataclass(frozen=True)
 class Encoder:
     """time [K] s on the drives' clock | place, velocity [K, axes] m, rad and /s | current A, following
 
-    following: demanded minus actual position, quadcounts | positions are those at the SYNC, one for each, and between its neighbours'
-    where one was not answered.  Times of simulated drives are SYNC's number times its period; those of real ones are when positions came,
-    as a host does not send SYNCs evenly.
+    following: demanded minus actual position, quadcounts | positions are those at the SYNC, one for each; where one was not sent in time or
+    not answered they are on the cubic through its neighbours' places and velocities.  Times of simulated drives are SYNC's number times its
+    period; those of real ones are when the first axis' positions came, as a host does not send SYNCs evenly, and the other axes' are
+    brought to these.
     """
 
     time: np.ndarray
@@ -38,40 +47,79 @@ class Encoder:
 
 
 class Recorder:
-    """Keeps what drives told, at the rate of the rig's record."""
+    """Writes down what drives told, at the rate of the rig's record, into a folder.  last: the latest rows of encoder.csv"""
 
-    def __init__(self, rig: Rig, simulated: bool) -> None:
-        self.rig, self.simulated = rig, simulated
+    def __init__(self, rig: Rig, simulated: bool, out: Path) -> None:
+        self.rig, self.simulated, self.out = rig, simulated, out
         self.every = max(1, round(1 / (rig.rate * rig.bus.sync_period)))
-        self.rows: list[str] = []
-        self.first = 0.0  # s of the interface's clock, at which the record begins
+        self.last: deque[str] = deque(maxlen=LAST)
+        self.first = self.began = self.apart = 0.0  # s: the record's beginning by the interface's and the host's clock; their difference
         self.events: list[dict[str, Any]] = []
+        self.taken = -1
+        self.part = out / f".{ENCODER}.{os.getpid()}.part"
+        self.file = self.part.open("w", encoding="utf-8")
+        self.file.write((COLUMNS if simulated else f"{COLUMNS},{RECEIVED}") + "\n")
 
     def take(self, k: int, drives: list[Drive]) -> None:
-        """What was told with SYNC k; nothing where a drive did not answer it."""
-        if k % self.every:
+        """What was told with SYNC k, of those that are recorded the next; nothing where a drive did not answer it."""
+        if k // self.every == self.taken // self.every and self.taken >= 0:
             return
-        if not all(drive.complete for drive in drives):
-            self.note(k, "not answered")
+        silent = [drive.axis.name for drive in drives if not drive.complete]
+        if silent:
+            self.note(k, "not answered", axes=silent)
             return
-        self.first = self.first or drives[0].stamp
-        time = k * self.rig.bus.sync_period if self.simulated else drives[0].stamp - self.first
+        self.taken = k
+        when = k * self.rig.bus.sync_period if self.simulated else self._since(drives[0].told.stamp)
         for drive in drives:
             told, axis = drive.told, drive.axis
             x, v = float(from_quadcounts(axis, told.position)), from_rpm(axis, told.velocity)
-            row = f"{k},{time:.6f},{axis.name},{told.position},{x:.9g},{v:.9g},{told.current / 1e3:g},{told.following},{told.statusword}"
-            self.rows.append(row if self.simulated else f"{row},{drive.stamp:.6f}")
+            row = f"{k},{when:.6f},{axis.name},{told.position},{x:.9g},{v:.9g},{told.current / 1e3:g},{told.following},{told.statusword}"
+            row = row if self.simulated else f"{row},{told.stamp:.6f}"
+            self.last.append(row)
+            try:
+                self.file.write(f"{row}\n")
+            except OSError as error:
+                raise _unwritten(self.part, error) from error
+
+    def _since(self, stamp: float) -> float:
+        """s since the record began; RigError where the clock that tells so was set meanwhile."""
+        now = time.monotonic()
+        if not self.first:
+            self.first, self.began = stamp, now
+        before, self.apart = self.apart, (stamp - self.first) - (now - self.began)
+        if abs(self.apart - before) > STEP:
+            remedy = "let no time service set this machine's clock while the rig runs (slewing is no harm)"
+            raise RigError(f"the interface's clock jumped by {self.apart - before:.3f} s, and times are of no use\n  what to do: {remedy}")
+        return stamp - self.first
 
     def note(self, k: int, what: str, **more: Any) -> None:
         """An event for the log."""
         self.events.append({"k": k, "what": what, **more})
 
-    def write(self, out: Path, said: dict[str, Any]) -> None:
-        """encoder.csv, log.jsonl and run.json, each appearing when it is whole."""
-        head = COLUMNS if self.simulated else f"{COLUMNS},{RECEIVED}"
-        write_whole(out / ENCODER, "\n".join([head, *self.rows]) + "\n")
-        write_whole(out / LOG, "".join(json.dumps(event) + "\n" for event in self.events))
-        write_whole(out / RUN, json.dumps(said, indent=2) + "\n")
+    def write(self, said: dict[str, Any]) -> RigError | None:
+        """encoder.csv, log.jsonl and run.json, each appearing when it is whole -> what went wrong; whatever else can be written is."""
+        failed: RigError | None = None
+        log = "".join(json.dumps(event) + "\n" for event in self.events)
+        writes: list[tuple[str, Callable[[], object]]] = [
+            (ENCODER, self._finish),
+            (LOG, lambda: write_whole(self.out / LOG, log)),
+            (RUN, lambda: write_whole(self.out / RUN, json.dumps(said, indent=2) + "\n")),
+        ]
+        for name, write in writes:
+            try:
+                write()
+            except OSError as error:
+                failed = failed or _unwritten(self.out / name, error)
+                said["status"] = f"aborted: {failed}" if said["status"] == "complete" else said["status"]
+        return failed
+
+    def _finish(self) -> None:
+        self.file.close()
+        self.part.replace(self.out / ENCODER)
+
+
+def _unwritten(path: Path, error: OSError) -> RigError:
+    return RigError(f"{path}: cannot be written: {error.strerror}\n  what to do: make room on its disk; what is there of it is kept")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
@@ -100,22 +148,21 @@ def read_encoder(path: Path | str, rig: Rig) -> Encoder:
         try:
             if len(parts) != width or parts[2] != names[(number - 2) % len(names)]:
                 raise ValueError("its axes and columns do not fit")
-            columns.append([float(part) for i, part in enumerate(parts[:9]) if i != 2])
+            columns.append([float(part) for i, part in enumerate(parts) if i != 2])
         except ValueError as error:
             raise Refused(f"{file}, line {number}: {error}\n  what to do: {remedy}") from error
     if not columns or len(columns) % len(names):
         raise Refused(f"{file}: ends in the middle of a sample\n  what to do: {remedy}")
-    table = np.array(columns).reshape(-1, len(names), 8)
-    k, time = table[:, 0, 0], table[:, 0, 1]
-    if not np.isfinite(table).all() or (np.diff(k) <= 0).any() or (np.diff(time) <= 0).any():
+    table = np.array(columns).reshape(-1, len(names), width - 1)
+    k, when = table[:, 0, 0], table[:, 0, 1]
+    came = table[..., 8] - table[:1, :1, 8] + when[0] if width > len(COLUMNS.split(",")) else np.repeat(when[:, None], len(names), 1)
+    if not np.isfinite(table).all() or (np.diff(k) <= 0).any() or (np.diff(came, axis=0) <= 0).any() or (np.diff(when) <= 0).any():
         raise Refused(f"{file}: its samples are not in order, or not finite\n  what to do: {remedy}")
-    table = _filled(table, np.arange(k[0], k[-1] + 1, max(1, round(1 / (rig.rate * rig.bus.sync_period)))))
-    return Encoder(table[:, 0, 1], table[..., 3], table[..., 4], table[..., 5], table[..., 6])
-
-
-def _filled(table: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Samples [K, axes, 8] for every k."""
-    if len(k) == len(table):
-        return table
-    flat = table.reshape(len(table), -1)
-    return np.stack([np.interp(k, table[:, 0, 0], column) for column in flat.T], 1).reshape(len(k), *table.shape[1:])
+    every = max(1, round(1 / (rig.rate * rig.bus.sync_period)))
+    times = np.interp(np.arange(k[0], k[-1] + 1, every), k, when)
+    if len(times) == len(when) and (came == when[:, None]).all():
+        return Encoder(when, table[..., 3], table[..., 4], table[..., 5], table[..., 6])
+    place = [CubicHermiteSpline(came[:, i], table[:, i, 3], table[:, i, 4])(times) for i in range(len(names))]
+    others = [[np.interp(times, came[:, i], table[:, i, column]) for i in range(len(names))] for column in (4, 5, 6)]
+    velocity, current, following = (np.stack(columns, 1) for columns in others)
+    return Encoder(times, np.stack(place, 1), velocity, current, following)

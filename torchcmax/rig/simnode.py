@@ -84,6 +84,7 @@ class Line:
 class Faults:
     """What goes wrong with a simulated drive, from when it is set.
 
+    rough: its velocity is that of whole counts in the last period
     altered: objects that say something else than what was written | aborted: objects whose writing is refused, with the abort code
     """
 
@@ -92,6 +93,7 @@ class Faults:
     muted: bool = False
     heat: float | None = None
     limit_input: bool = False
+    rough: bool = False
     refused_mode: int | None = None
     vendor: int | None = None
     altered: dict[Object, int] = field(default_factory=dict)
@@ -158,6 +160,7 @@ class SimulatedDrive:
         self.latched: list[tuple[list[Object], bytes]] = []
         self.sent: list[tuple[int, list[Object]]] = []
         self.number = axis.node_id
+        self._counts, self._step = 0, o.speed_step(axis, self.period)
         self._delivered = _defaults(axis.family)
         self.node = canopen.LocalNode(axis.node_id, dictionary(axis.family))
         self.node._write_callbacks.clear()  # canopen's would start a thread that sends heartbeats; here they come with the SYNC
@@ -230,7 +233,7 @@ class SimulatedDrive:
         if obj == o.POSITION:
             return self.position
         if obj == o.VELOCITY:
-            return round(self.plant.velocity * 30 / math.pi)
+            return round(self.plant.velocity * 30 / math.pi) if not self.faults.rough else round(self._counts * self._step)
         if obj == self.family.current:
             return round(self.plant.current * 1e3)
         if obj == self.family.following:
@@ -330,8 +333,10 @@ class SimulatedDrive:
         latched, self.latched = self.latched, []
         for entries, word in latched:
             self._apply(entries, word)
+        before = self.position + self.zero
         self._watch()
         self._run()
+        self._counts = self.position + self.zero - before
         self.time += self.period
         produced = self.get(o.PRODUCER_HEARTBEAT) / 1e3
         if produced and self.time - self._spoken >= produced and not self.faults.dropped:
