@@ -67,6 +67,18 @@ def velocities(rng, driven, offset, drift=FAST, noise=0.01):
     return Seen(camera[:-1], camera[1:], mean[:, None])
 
 
+@pytest.fixture(scope="module")
+def standard(slider, tmp_path_factory):
+    """The pattern `sync: {}` of configs/rig/slider.yaml, 9 s: what its drives do."""
+    from torchcmax.rig.plan import plan
+    from torchcmax.rig.profilefile import load_profile
+
+    file = tmp_path_factory.mktemp("profile") / "sync.yaml"
+    file.write_text("profile: [{axis: x, sync: {}}]")
+    samples = plan(slider, load_profile(file, slider)).samples
+    return Driven(samples.time, samples.v[:, :1], samples.x[:, 0])
+
+
 def off(model, driven, offset, drift=FAST):
     """s: how wrong the camera's time of mid-run is."""
     middle = driven.time[-1] / 2
@@ -104,10 +116,53 @@ def test_a_long_run_tells_the_drift(method, make, seconds):
     assert "ppm" in other.reason
 
 
+@pytest.mark.parametrize(("method", "make", "seeds"), [("velocity", velocities, 20), ("rate", rates, 2)])
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
+def test_the_standard_pattern_tells_the_offset_of_a_common_clock(method, make, seeds, drift, standard):
+    """Of one whose drift, as all quartzes', is below 50 ppm: that cannot be told from 9 s, and is within sigma at either end."""
+    for seed in range(seeds):
+        model = align(standard, make(np.random.default_rng(seed), standard, 5.0, drift=drift), method)
+        assert model.accepted, (seed, model.reason)
+        assert abs(off(model, standard, 5.0, drift)) < 0.5e-3
+        end = standard.time[-1]
+        assert abs(float(model.camera(end)) - (5 + (1 + drift) * end)) < 3 * model.sigma_within(end / 2)
+
+
+@pytest.mark.parametrize(("method", "make", "seeds"), [("velocity", velocities, 10), ("rate", rates, 1)])
+@pytest.mark.parametrize("drift", [300e-6, -500e-6, 1e-3, 4e-3])
+def test_a_drift_that_no_quartz_has_is_refused_or_within_sigma(method, make, seeds, drift, standard):
+    """300 ppm are 338 or 277 with a deviation of 22 to 80: not always surely above 200."""
+    for seed in range(seeds):
+        model = align(standard, make(np.random.default_rng(seed), standard, 5.0, drift=drift), method)
+        assert not model.accepted or drift == 300e-6, seed
+        end = standard.time[-1]
+        if model.accepted:
+            assert abs(float(model.camera(end)) - (5 + (1 + drift) * end)) < 2 * model.sigma_within(end / 2)
+        elif abs(drift) <= 1e-3:
+            assert "ppm faster" in model.reason
+
+
+def test_a_clock_is_as_uncertain_as_its_drift_lets_it_be():
+    model = ClockModel(0.0, 0.0, 0.3e-3, 100e-6, "velocity", 0.5)
+    assert model.sigma_within(0.0) == 0.3e-3
+    assert model.sigma_within(4.0) == pytest.approx(0.5e-3)
+
+
+def test_times_far_apart_are_refused_before_there_is_a_grid_of_them():
+    """One stamp of the year 2023 beside times from 0 would want 3e11 cells."""
+    driven = pattern()
+    for stray in (-1.7e9, -5.8 * 86400):
+        seen = velocities(np.random.default_rng(0), driven, 3.0)
+        seen = Seen(np.append(stray, seen.start), np.append(stray + 0.01, seen.end), np.append(seen.value[:1], seen.value, 0))
+        model = align(driven, seen, "velocity")
+        assert not model.accepted
+        assert "more than 21600 s" in model.reason
+
+
 @pytest.mark.parametrize("rms", [0.0, 0.05, 0.25])
 def test_a_single_pass_is_refused_by_rate(rms):
     driven = run([trapezoid(0.5, 1.0)])
-    for seed in range(5):
+    for seed in range(2):
         model = align(driven, rates(np.random.default_rng(seed), driven, 3.0, rms=rms), "rate")
         assert not model.accepted
         assert "pass" in model.reason

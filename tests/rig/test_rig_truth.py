@@ -43,7 +43,7 @@ def test_poses_are_those_of_the_chain_in_the_cameras_clock(name, request, tmp_pa
     np.testing.assert_allclose(drives.time.numpy() * 1e-6, TIME, atol=0.6e-6)
     assert said == json.loads((tmp_path / "truth.json").read_text())
     assert (said["status"], said["simulated"], said["truth"]) == ("complete", True, True)
-    assert said["sigma_t"] == 2e-4
+    assert said["sigma_t"] == pytest.approx(math.hypot(2e-4, 5e-6))  # s, at the ends: 1 s at 5 ppm from mid-run
     assert said["clock"]["accepted"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         ["groundtruth.txt", "groundtruth_driveclock.txt", "truth.json", "twist.txt"]
@@ -84,6 +84,7 @@ def test_no_ground_truth_without_a_normal_end_and_an_accepted_clock(slider, tmp_
     assert not (tmp_path / "groundtruth.txt").exists()
     assert read_trajectory(tmp_path / "groundtruth_driveclock.txt").time[-1] == 2_000_000
     assert (said["status"], said["truth"], said["sigma_t"]) == (status, False, None)
+    assert said == json.loads((tmp_path / "truth.json").read_text())
     assert "the drives' clock" in (tmp_path / "twist.txt").read_text().splitlines()[0]
 
 
@@ -104,10 +105,15 @@ def test_sigma_of_a_position(slider):
     assert sigma(tight) == pytest.approx(1.804e-6, rel=1e-3)
 
 
-def test_too_few_samples_are_refused(slider, tmp_path):
-    few = Encoded(TIME[:20], np.zeros((20, 1)), ENDED, True)
+@pytest.mark.parametrize("status", [ENDED, "aborted: stopped by the user"])
+def test_too_few_samples_are_refused_and_are_no_truth(slider, tmp_path, status):
+    write_truth(tmp_path, slider, swing(slider), CLOCK)
+    few = Encoded(TIME[:20], np.zeros((20, 1)), status, True)
     with pytest.raises(Refused, match="20 samples"):
         write_truth(tmp_path, slider, few, CLOCK)
+    said = json.loads((tmp_path / "truth.json").read_text())
+    assert (said["status"], said["truth"]) == (status, False)
+    assert not (tmp_path / "groundtruth.txt").exists()
 
 
 def test_repeatability_is_the_spread_of_the_cycles_where_it_is_largest(slider):

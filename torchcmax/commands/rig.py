@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
+import signal
 import sys
+import threading
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
 from tqdm import tqdm
 
 from torchcmax.commands import rigtruth
 from torchcmax.commands.arguments import folder
-from torchcmax.config import Parser, UsageError
+from torchcmax.commands.rigtruth import tell
+from torchcmax.config import USAGE_ERROR, Parser, UsageError
+from torchcmax.io import DataError
+from torchcmax.rig.errors import Aborted, Refused, RigError
 
 if TYPE_CHECKING:  # the extra may be missing
     from torchcmax.rig.config import Rig
@@ -24,12 +29,13 @@ if TYPE_CHECKING:  # the extra may be missing
 
 SUMMARY = "move a motor rig, and make ground truth from its encoders"
 EXTRA = ("can", "canopen", "scipy", "matplotlib")
+AT_THE_RIG = ("run", "home", "record")
 EMERGENCY = "a hardware emergency stop within reach is your duty; nothing that this program does is a safety function"
 DESCRIPTION = (
     "Move a motor rig (slider, rotary stage, pan-tilt; maxon EPOS4 and EPOS2 drives on CANopen) and make ground truth from its encoders: "
     "plan, check, home, run, sync, truth. Try it without hardware: run --dry-run. Mind: "
-    f"{EMERGENCY}. docs/rig.md leads from a new rig to its first run. Exits 0: done, 2: configuration or plan refused, 3: a drive's fault, "
-    "4: communication lost, 5: stopped by the user, 6: clocks not aligned."
+    f"{EMERGENCY}. docs/rig.md leads from a new rig to its first run. Exits 0: done, 2: configuration, plan or a file refused, "
+    "3: a drive's fault, or anything unforeseen while a rig is moved, 4: communication lost, 5: stopped by the user, 6: clocks not aligned."
 )
 ARM_HELP = f"let hardware move: {EMERGENCY}"
 
@@ -51,18 +57,35 @@ def add_actions(parser: Parser) -> None:
 def run(config: Namespace) -> int:
     """torchcmax rig"""
     try:
-        from torchcmax.rig.errors import RigError
-
-        try:
+        with _terminable():
             ACTIONS[config.action][1](config[config.action])
-        except RigError as error:
-            print(f"torchcmax rig {config.action}: {error}", file=sys.stderr)
-            return error.code
-    except ModuleNotFoundError as error:
-        if error.name not in EXTRA:
+    except (RigError, DataError) as error:
+        tell(f"torchcmax rig {config.action}: {error}", sys.stderr)
+        return error.code if isinstance(error, RigError) else USAGE_ERROR
+    except KeyboardInterrupt:
+        tell(f"\ntorchcmax rig {config.action}: stopped by the user", sys.stderr)
+        return Aborted.code
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in EXTRA:
+            raise UsageError(f"{error.name} is not installed; what to do: pip install 'torchcmax[rig]'") from error
+        if isinstance(error, UsageError) or config.action not in AT_THE_RIG:
             raise
-        raise UsageError(f"{error.name} is not installed; what to do: pip install 'torchcmax[rig]'") from error
+        tell(traceback.format_exc(), sys.stderr)
+        return RigError.code
     return 0
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM is Ctrl-C; while drives are on, the runner takes both."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _rig_options(sub: Parser) -> None:
@@ -126,55 +149,65 @@ def _motors(config: Namespace) -> None:
 
     shown = "voltage no_load_speed nominal_speed nominal_torque nominal_current resistance torque_constant max_speed".split()
     heads = [UNITS[name][0] for name in shown]
-    print("  ".join(["part  ", *heads, "motor"]))
+    tell("  ".join(["part  ", *heads, "motor"]))
     for motor in motors().values():
         numbers = [f"{getattr(motor, name) / UNITS[name][1]:>{len(head)}.4g}" for name, head in zip(shown, heads, strict=True)]
-        print("  ".join([motor.part, *numbers, motor.family]))
+        tell("  ".join([motor.part, *numbers, motor.family]))
     for motor in motors().values() if config.verify else ():
         for found in verify(motor):
             column, unit = UNITS[found.field]
             verdict = "OUTSIDE OF ROUNDING" if found.outside_rounding else "within rounding"
             numbers = [f"printed {found.printed / unit:.4g}, computed {found.computed / unit:.4g}, {100 * found.relative:+.2f} %"]
-            print(f"{motor.part}  {column} = {found.identity}: {numbers[0]}, {verdict}")
+            tell(f"{motor.part}  {column} = {found.identity}: {numbers[0]}, {verdict}")
 
 
 def _plan(config: Namespace) -> None:
+    out = folder(config.out) if config.out else None
+    if out is not None and (out / "encoder.csv").exists():
+        raise UsageError(f"{out} holds a run: give another folder for the plan")
     plan = _planned(config)
-    print(_table(plan))
-    if config.out:
-        out = folder(config.out)
-        if (out / "encoder.csv").exists():
-            raise UsageError(f"{out} holds a run: give another folder for the plan")
-        _write_plan(out, config, plan)
+    tell(_table(plan))
+    if out is not None:
+        _begin(out, config)
+        _draw(out, plan)
     plan.refuse()
 
 
 def _run(config: Namespace) -> None:
     from torchcmax.rig.runner import run
 
-    plan, out = _planned(config), folder(config.out)
-    plan.refuse()
+    out = folder(config.out)
     _armed(config)
-    _write_plan(out, config, plan)
-    with _watched(config, plan.program.duration * config.repeat, plan.rig) as watch, rigtruth.kept(out, plan.rig, plan.samples):
-        told = {"simulate": config.dry_run, "arm": config.arm, "repeat": config.repeat, "reset": config.reset_fault}
-        run(plan.rig, plan.program, out, watch=watch, **told)
-    print(f"run: {out}, {'simulated' if config.dry_run else plan.rig.name}; the clock is next: torchcmax rig sync {out} --help")
+    try:
+        plan = _planned(config)
+    except KeyboardInterrupt:
+        rigtruth.clear(out, rigtruth.OF_RUNS)  # who goes on with this folder takes it for this run's
+        raise
+    plan.refuse()
+    _begin(out, config)
+    with rigtruth.kept(out, plan.rig, config.dry_run, plan.samples):
+        _draw(out, plan)
+        with _watched(config, plan.program.duration * config.repeat, plan.rig) as watch:
+            told = {"simulate": config.dry_run, "arm": config.arm, "repeat": config.repeat, "reset": config.reset_fault}
+            run(plan.rig, plan.program, out, watch=watch, **told)
+    tell(f"run: {out}, {'simulated' if config.dry_run else plan.rig.name}; the clock is next: torchcmax rig sync {out} --help")
 
 
 def _home(config: Namespace) -> None:
     from torchcmax.rig.runner import home
 
+    _armed(config)
     rig, out = _rig(config), folder(config.out)
+    _begin(out, config)
     with _watched(config, 0.0, rig) as watch:
         home(rig, out, simulate=config.dry_run, arm=config.arm, reset=config.reset_fault, watch=watch)
-    print(f"home is known; log: {out / 'log.jsonl'}")
+    tell(f"home is known; log: {out / 'log.jsonl'}")
 
 
 def _check(config: Namespace) -> None:
     from torchcmax.rig.runner import check
 
-    print(json.dumps(check(_rig(config), simulate=config.dry_run), indent=2))
+    tell(json.dumps(check(_rig(config), simulate=config.dry_run), indent=2))
 
 
 def _record(config: Namespace) -> None:
@@ -184,15 +217,13 @@ def _record(config: Namespace) -> None:
         raise UsageError(f"--duration wants seconds above 0, got {config.duration}")
     rig, out = _rig(config), folder(config.out)
     _begin(out, config)
-    with _watched(config, config.duration, rig) as watch, rigtruth.kept(out, rig):
+    with rigtruth.kept(out, rig, config.dry_run), _watched(config, config.duration, rig) as watch:
         watch_encoders(rig, out, config.duration, simulate=config.dry_run, watch=watch)
-    print(f"record: {out / 'encoder.csv'}")
+    tell(f"record: {out / 'encoder.csv'}")
 
 
 def _armed(config: Namespace) -> None:
     """Nothing of an older run goes away for one that may not begin."""
-    from torchcmax.rig.errors import Refused
-
     if not (config.dry_run or config.arm):
         raise Refused(f"this would move hardware, and is not armed\n  what to do: try --dry-run, or give --arm; {EMERGENCY}")
 
@@ -228,34 +259,52 @@ def _table(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def _write_plan(out: Path, config: Namespace, plan: Plan) -> None:
-    """plan.json, pictures of it, and what it was made of."""
+def _begin(out: Path, config: Namespace) -> None:
+    """A folder with the files that the command was given, and without what an older run left there."""
+    from torchcmax.rig.record import write_whole
+
+    given = {rigtruth.LOCK: config.rig, "profile.yaml": config.get("profile")}
+    try:
+        contents = {name: Path(file).read_bytes() for name, file in given.items() if file}  # which may lie in this very folder
+        out.mkdir(parents=True, exist_ok=True)
+        rigtruth.clear(out, rigtruth.OF_RUNS)  # what does not begin leaves nothing that could be taken for its own
+        for name, content in contents.items():
+            write_whole(out / name, content)
+    except OSError as error:
+        raise UsageError(f"{error.filename}: {error.strerror}; what to do: give another folder with -o") from error
+
+
+def _draw(out: Path, plan: Plan) -> None:
+    """plan.json, and pictures of it."""
     from torchcmax.rig import picture
     from torchcmax.rig.record import write_whole
 
-    _begin(out, config)
-    shutil.copyfile(config.profile, out / "profile.yaml")
     write_whole(out / "plan.json", json.dumps(plan.summary(), indent=2) + "\n")
     write_whole(out / "motion.png", picture.motion(plan.rig, plan.samples, None))
     for k, axis in enumerate(plan.rig.axes):
         write_whole(out / f"oprange_{axis.name}.png", picture.operating_range(plan.rig, k, plan.samples))
 
 
-def _begin(out: Path, config: Namespace) -> None:
-    """A folder with the rig's file, and without what an older run left there."""
-    out.mkdir(parents=True, exist_ok=True)
-    for name in rigtruth.OF_CLOCKS + rigtruth.OF_RUNS:  # what does not begin leaves nothing that could be taken for its own
-        (out / name).unlink(missing_ok=True)
-    shutil.copyfile(config.rig, out / rigtruth.LOCK)
+class _Screen:
+    """sys.stderr for a bar that must not stop a rig."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+    def write(self, text: str) -> None:
+        tell(text, sys.stderr, "")
+
+    def flush(self) -> None:
+        """Each write is."""
 
 
 @contextmanager
 def _watched(config: Namespace, seconds: float, rig: Rig) -> Iterator[Callable[[int], None]]:
     """A progress bar in seconds of the drives' clock, which is told the SYNCs; and what nobody may forget."""
     if config.get("arm") and not config.dry_run:
-        print(f"mind: {EMERGENCY}", file=sys.stderr)
+        tell(f"mind: {EMERGENCY}", sys.stderr)
     layout = "{l_bar}{bar}| {n:.1f}/{total:.1f} s [{elapsed}]"
-    with tqdm(total=seconds, desc=rig.name, disable=config.quiet, bar_format=layout) as bar:
+    with tqdm(total=seconds, desc=rig.name, disable=config.quiet, bar_format=layout, file=_Screen()) as bar:
 
         def watch(k: int) -> None:
             if k % 100 == 0:

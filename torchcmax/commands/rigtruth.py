@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from jsonargparse import Namespace
 
 from torchcmax.config import Parser, UsageError
-from torchcmax.io import open
+from torchcmax.io import OpenOptions, open
 from torchcmax.io.recording import Recording
 from torchcmax.resultfiles import read_result
 
@@ -24,8 +27,12 @@ if TYPE_CHECKING:  # the extra may be missing
     from torchcmax.rig.truth import Encoded
 
 LOCK, CLOCK = "config.lock.yaml", "clock.json"
-OF_CLOCKS = (CLOCK, "groundtruth.txt", "truth.json")
-OF_RUNS = ("encoder.csv", "log.jsonl", "run.json", "groundtruth_driveclock.txt", "twist.txt", "motion.png", "repeat.png")
+OF_CLOCKS = (CLOCK, "groundtruth.txt", "truth.json", "twist.txt")
+OF_RUNS = (
+    *OF_CLOCKS, "profile.yaml", "plan.json", "encoder.csv", "log.jsonl", "run.json", "groundtruth_driveclock.txt",
+    "motion.png", "repeat.png", "oprange_*.png",
+)  # fmt: skip
+ANY_CAMERA = OpenOptions(camera="pinhole")  # nobody looks where events are
 BIN = 0.002  # s, in which events are counted
 AWAKE = 0.15  # of the 90 % quantile of events a second: with less, a window is of a camera at rest
 
@@ -44,24 +51,21 @@ def sync(config: Namespace) -> None:
     """clock.json, also of a clock that is not accepted."""
     from torchcmax.rig.clock import align
     from torchcmax.rig.record import write_whole
-    from torchcmax.rig.truth import told
+    from torchcmax.rig.truth import told as parts
 
     if bool(config.result) == bool(config.events):
         raise UsageError("give one of --result FOLDER, to align by velocity, and --events RECORDING, to align by the rate of events")
     out = Path(config.run)
     rig, encoded = read_run(out)
-    for name in (*OF_CLOCKS, "twist.txt"):  # of an older clock
-        (out / name).unlink(missing_ok=True)
     driven, turning = _driven(rig, encoded)
-    if config.result:
-        clock = align(driven, _velocities(Path(config.result), turning), "velocity")
-    else:
-        clock = align(driven, _rates(open(config.events)), "rate")
-    write_whole(out / CLOCK, json.dumps(told(clock), indent=2) + "\n")
-    print(f"clock: {out / CLOCK}")
+    seen = _velocities(Path(config.result), turning) if config.result else _rates(open(config.events, ANY_CAMERA))
+    clear(out, OF_CLOCKS)  # of an older clock
+    clock = align(driven, seen, "velocity" if config.result else "rate")
+    write_whole(out / CLOCK, json.dumps(parts(clock) | _whose(out, rig), indent=2) + "\n")
+    tell(f"clock: {out / CLOCK}")
     clock.demand()
-    drift = f"{clock.drift * 1e6:.0f} ppm" if clock.drift else f"not known, {clock.drift_sigma * 1e6:.0f} ppm"
-    print(f"the camera's clock is {clock.offset:.6f} s ahead, sigma {clock.sigma * 1e3:.2f} ms; drift {drift}")
+    drift = f"{clock.drift * 1e6:.0f} ppm, sigma {clock.drift_sigma * 1e6:.0f} ppm"
+    tell(f"the camera's clock is {clock.offset:.6f} s ahead, sigma {clock.sigma * 1e3:.2f} ms; drift {drift}")
 
 
 def truth(config: Namespace) -> None:
@@ -71,36 +75,61 @@ def truth(config: Namespace) -> None:
 
     out = Path(config.run)
     rig, encoded = read_run(out)
-    clock = _clock(out)
+    clock = _clock(out, rig)
     said = write_truth(out, rig, encoded, clock)
     if clock is None:
         raise Rejected(f"{out}: the camera's clock is not known\n  what to do: torchcmax rig sync {out} --result FOLDER")
     clock.demand()
     if not said["truth"]:
         raise Rejected(f"{out}: the run did not end normally, {encoded.status}\n  what to do: run it again")
-    print(f"truth: {out / TRUTH}")
+    tell(f"truth: {out / TRUTH}")
+
+
+def tell(text: str, stream: TextIO | None = None, end: str = "\n") -> None:
+    """Print.  Whoever reads it may be gone, or its disk full: what a rig does goes on, and the exit status says how."""
+    stream = stream or sys.stdout
+    try:
+        print(text, end=end, file=stream, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def clear(out: Path, patterns: tuple[str, ...]) -> None:
+    """Without these files."""
+    for pattern in patterns:
+        for path in out.glob(pattern):
+            path.unlink()
 
 
 @contextmanager
-def kept(out: Path, rig: Rig, planned: Samples | None = None) -> Iterator[None]:
-    """What the encoders told by the drives' clock is written down and drawn, however the run ended."""
+def kept(out: Path, rig: Rig, simulated: bool, planned: Samples | None = None) -> Iterator[None]:
+    """What the encoders told by the drives' clock is written down and drawn, however the run ended; truth.json says from the first how."""
+    from torchcmax.rig.errors import Refused
+    from torchcmax.rig.record import write_whole
+    from torchcmax.rig.truth import SAID
+
+    def say(why: str) -> None:
+        said = {"status": f"aborted: {why}", "simulated": simulated, "configuration": rig.digest, "truth": False}
+        write_whole(out / SAID, json.dumps(said, indent=2) + "\n")
+
+    say("it did not end")
     try:
         yield
-    finally:
         _keep(out, rig, planned)
+    except BaseException as error:
+        with suppress(OSError, Refused):  # there may be no samples; and why it ended counts more
+            say(str(error) or type(error).__name__)
+            _keep(out, rig, planned)
+        raise
 
 
 def _keep(out: Path, rig: Rig, planned: Samples | None) -> None:
     from torchcmax.rig import picture
-    from torchcmax.rig.errors import Refused
     from torchcmax.rig.record import write_whole
     from torchcmax.rig.truth import write_truth
 
-    try:
-        _, encoder, said = _read(out)
-        write_truth(out, rig, _encoded(rig, encoder, said), None)
-    except Refused:  # it ended before there were samples; why is told by whoever ended it
-        return
+    _, encoder, said = _read(out)
+    write_truth(out, rig, _encoded(rig, encoder, said), None)
     cycles = _cycles(rig, said)
     write_whole(out / "motion.png", picture.motion(rig, planned, encoder, cycles))
     if len(cycles) > 1:
@@ -154,7 +183,14 @@ def _json(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _clock(out: Path) -> ClockModel | None:
+def _whose(out: Path, rig: Rig) -> dict[str, str]:
+    """What a clock belongs to: SHA-256 of the rig's file and of the record."""
+    from torchcmax.rig.record import ENCODER
+
+    return {"configuration": rig.digest, "record": hashlib.sha256((out / ENCODER).read_bytes()).hexdigest()}
+
+
+def _clock(out: Path, rig: Rig) -> ClockModel | None:
     """As sync left it."""
     from torchcmax.rig.clock import ClockModel
     from torchcmax.rig.errors import Refused
@@ -162,6 +198,8 @@ def _clock(out: Path) -> ClockModel | None:
     if not (out / CLOCK).exists():
         return None
     said: dict[str, Any] = {name: np.inf if value is None else value for name, value in _json(out / CLOCK).items() if name != "accepted"}
+    if (whose := _whose(out, rig)) != {name: said.pop(name, None) for name in whose}:
+        raise Refused(f"{out / CLOCK}: is the clock of another run\n  what to do: torchcmax rig sync {out} --result FOLDER")
     try:
         return ClockModel(**said)
     except TypeError as error:
@@ -197,7 +235,7 @@ def _velocities(folder: Path, turning: bool) -> Seen:
 
 def _rates(recording: Recording) -> Seen:
     """Events a second in short bins."""
-    from torchcmax.rig.clock import Seen
+    from torchcmax.rig.clock import LONGEST, Seen
 
     counts: dict[int, int] = {}
     for chunk in recording.chunks():
@@ -205,6 +243,6 @@ def _rates(recording: Recording) -> Seen:
         for k, count in zip(bins.tolist(), events.tolist(), strict=True):
             counts[k] = counts.get(k, 0) + count
     first, last = (min(counts), max(counts)) if counts else (0, 0)
-    every = np.arange(first + 1, last)  # the outer ones are not whole
+    every = np.arange(first + 1, last) if (last - first) * BIN < LONGEST else np.array([first, last])  # the outer ones are not whole
     value = np.array([counts.get(k, 0) for k in every.tolist()], float).reshape(-1, 1) / BIN
     return Seen(every * BIN, (every + 1) * BIN, value)

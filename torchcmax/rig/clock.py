@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +25,7 @@ STEADY = 0.1  # of the fastest: windows in which the drives are slower at either
 BLOCKS = 5  # of the run, each left out once
 CLEAR, FASTEST, SURE = 0.3, 200e-6, 1e-3  # peak to side at least; drift and sigma, s, at most
 WIDEST, KNOWN = 500e-6, 20e-6  # drift that is looked for, and the sigma below which it is told
+LONGEST = 6 * 3600.0  # s between the camera's first and last window
 TRUSTED = 3.0  # times the 90 % quantile: what is faster is no velocity
 
 
@@ -54,7 +56,8 @@ class ClockModel:
 
     offset s | sigma: its standard deviation at mid-run, s, of chance alone: how late the camera reports, by velocity some 0.3 ms, by rate
     the time of a pixel, is within the offset
-    drift_sigma: where it is above 20 ppm, drift is not told and 0 | peak_to_side: by which share other offsets correlate less
+    drift_sigma: of the drift.  One that is not known to 20 ppm is not told, and 0; this is then how far from 0 it may be
+    peak_to_side: by which share other offsets correlate less
     reason: why it is not accepted, empty where it is
     """
 
@@ -74,6 +77,10 @@ class ClockModel:
         """Of the drives' clock -> of the camera's."""
         return self.offset + (1 + self.drift) * time
 
+    def sigma_within(self, seconds: float) -> float:
+        """Standard deviation, s, of the camera's time so long before or after mid-run."""
+        return math.hypot(self.sigma, self.drift_sigma * seconds)
+
     def demand(self) -> None:
         """Rejected where it is not accepted."""
         if self.reason:
@@ -83,6 +90,8 @@ class ClockModel:
 def align(driven: Driven, seen: Seen, method: Method) -> ClockModel:
     """The camera's clock may begin anywhere; the pattern of the motion must not repeat itself."""
     seen = _usable(seen)
+    if (span := seen.end.max(initial=-np.inf) - seen.start.min(initial=np.inf)) > LONGEST:
+        return _unknown(method, f"the camera's times go over {span:.0f} s, more than {LONGEST:.0f} s: some of them are wrong")
     if not np.ptp(driven.place) or len(seen.start) < 10 * BLOCKS or not seen.value.any():
         return _unknown(method, f"the drives moved by {np.ptp(driven.place):.3g}, and the camera saw {len(seen.start)} windows with motion")
     first, clear = _first(driven, seen, method)
@@ -99,12 +108,14 @@ def align(driven: Driven, seen: Seen, method: Method) -> ClockModel:
     parts = np.array([fit.only(~block).best(shift, WIDEST)[:2] for block in blocks])
     spread = np.sqrt((BLOCKS - 1) * parts.var(0))  # delete-a-group jackknife, Shao and Tu 1995, 2.3
     sigma, drift_sigma = np.maximum(spread, chance)
+    found, surely = drift, np.inf if abs(drift) > 0.99 * WIDEST else abs(drift) - 2 * drift_sigma  # where it is looked for, it ends
     if drift_sigma > KNOWN:
         shift, drift, _ = fit.best(first, 0.0)
+        drift_sigma = math.hypot(found, drift_sigma)
     if method == "rate":  # what depends on how a sensor is thought to turn round is not known
         sigma = max(sigma, abs(_Fit(driven, seen, method, WAYS[:0]).best(first, 0.0)[0] - shift))
     often = np.abs(np.diff(driven.place)).sum() / np.ptp(driven.place)
-    reason = _reason(clear, drift, sigma, often if method == "rate" else np.inf)
+    reason = _reason(clear, found, surely, sigma, often if method == "rate" else np.inf)
     return ClockModel(float(shift - drift * fit.middle), float(drift), float(sigma), float(drift_sigma), method, clear, reason)
 
 
@@ -112,12 +123,13 @@ def _unknown(method: Method, reason: str) -> ClockModel:
     return ClockModel(0.0, 0.0, np.inf, np.inf, method, 0.0, reason)
 
 
-def _reason(clear: float, drift: float, sigma: float, often: float) -> str:
+def _reason(clear: float, drift: float, surely: float, sigma: float, often: float) -> str:
+    """surely: what the drift is above, but for one run in forty."""
     if clear < CLEAR:
         return f"another offset fits about as well (peak to side {clear:.2f}, wanted {CLEAR}): run the sync pattern, which never repeats"
     if often < AGAIN:
         return "one pass does not tell speed from texture by the rate of events: run the sync pattern, or align by velocity"
-    if abs(drift) > FASTEST:
+    if surely > FASTEST:
         return f"one clock would be {drift * 1e6:.0f} ppm faster, more than {FASTEST * 1e6:.0f} ppm: is it the recording of this run?"
     if not sigma <= SURE:
         return (

@@ -39,31 +39,34 @@ def write_truth(folder: Path, rig: Rig, encoded: Encoded, clock: ClockModel | No
     """Poses, velocities and what is known of them into the folder -> what truth.json says.
 
     groundtruth.txt, in the camera's clock, only where that clock is accepted and the run ended normally; an older one goes away.
+    Refused where there are too few samples, which truth.json then says.
     """
-    if len(encoded.time) < SAMPLES:
-        raise Refused(f"{folder}: {len(encoded.time)} samples of the encoders are too few for velocities, wanted are {SAMPLES}")
-    known = clock is not None and clock.accepted and encoded.status == ENDED
-    head = f"# configuration {rig.digest}{', simulated' if encoded.simulated else ''}; "
-    (folder / TRUTH).unlink(missing_ok=True)  # while it is written anew, there is none
-    poses = Chain(rig).pose(encoded.place)
-    write_whole(folder / BY_DRIVES, _poses(head + "the drives' clock", encoded.time, poses))
-    time, clock_name = (
-        (clock.camera(encoded.time), "the camera's clock") if clock is not None and known else (encoded.time, "the drives' clock")
-    )
-    inner, v, omega = motion(rig, encoded)
-    columns = "t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s"
-    write_whole(folder / TWIST, _lines(f"{head}{clock_name}; {columns}", time[inner], np.concatenate([v, omega], 1), ".9g"))
+    enough = len(encoded.time) >= SAMPLES
+    known = enough and clock is not None and clock.accepted and encoded.status == ENDED
     said: dict[str, Any] = {
         "status": encoded.status,
         "simulated": encoded.simulated,
         "configuration": rig.digest,
         "truth": known,
         "sigma_x": {axis.name: sigma(axis) for axis in rig.axes},
-        "sigma_t": clock.sigma if clock is not None and known else None,
+        "sigma_t": clock.sigma_within(float(np.ptp(encoded.time)) / 2) if clock is not None and known else None,
         "clock": None if clock is None else told(clock),
         "repeatability": encoded.repeatability,
     }
+    head = f"# configuration {rig.digest}{', simulated' if encoded.simulated else ''}; "
+    (folder / TRUTH).unlink(missing_ok=True)  # while it is written anew, there is none
+    time, clock_name = encoded.time, "the drives' clock"
+    if enough:
+        poses = Chain(rig).pose(encoded.place)
+        write_whole(folder / BY_DRIVES, _poses(head + clock_name, time, poses))
+        if clock is not None and known:
+            time, clock_name = clock.camera(time), "the camera's clock"
+        inner, v, omega = motion(rig, encoded)
+        columns = "t vx vy vz wx wy wz, camera's frame, s, m/s and rad/s"
+        write_whole(folder / TWIST, _lines(f"{head}{clock_name}; {columns}", time[inner], np.concatenate([v, omega], 1), ".9g"))
     write_whole(folder / SAID, json.dumps(said, indent=2) + "\n")
+    if not enough:
+        raise Refused(f"{folder}: {len(encoded.time)} samples of the encoders are too few for velocities, wanted are {SAMPLES}")
     if known:
         write_whole(folder / TRUTH, _poses(head + clock_name, time, poses))
     return said
