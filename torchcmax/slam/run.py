@@ -93,6 +93,7 @@ class Run:
         self.weak_since: int | None = None  # µs, of windows that met few edges; and of those of which it was unsure where
         self.unsure_since: int | None = None
         self.adrift: int | None = None  # µs, since when it may have gone on where there was only noise
+        self.rested = 0  # µs of noise since `weak_since`, which nobody holds against it
         self.index = self.losses = self.recoveries = self.joins = 0
 
     # windows
@@ -239,7 +240,7 @@ class Run:
         """From now on the camera is here, and nothing is held against it."""
         self.site, self.last, self.gathered, self.motion = site, site or self.last, [], None
         self.weak_since = self.unsure_since = None
-        self.adrift = None
+        self.adrift, self.rested = None, 0
 
     def _trace(self, home: Site, now: Belief) -> None:
         """The windows before a camera was found, the last one first, as long as they fit."""
@@ -296,6 +297,7 @@ class Run:
         """
         if self.adrift is None and speed(self._belief.state, site.map.plane, self.rays, self.canvas.focal) * RESTING > ADRIFT:
             self.adrift = seen.time
+        self.rested += round(float(seen.window.duration[0]) * 1e6)
         last = self._belief.at(seen.window.start, self.options.tracking.acceleration)  # where it was when the noise began
         state, covariance = still(last.state.pose), last.covariance.clone()
         covariance[:, 6:] = covariance[:, :, 6:] = 0
@@ -347,14 +349,15 @@ class Run:
         how = self.options.sensing
         if not site.usual or strength > how.weak * median(site.usual):
             site.usual.append(strength)
-            self.weak_since = None
+            self.weak_since, self.rested = None, 0
             if not unsure >= how.certain:
                 self.unsure_since = None
                 return "ok", ""
             self.unsure_since = time if self.unsure_since is None else self.unsure_since
             return "lost" if unsure >= how.hopeless else "weak", UNSURE
-        self.weak_since = time if self.weak_since is None else self.weak_since
-        return "lost" if (time - self.weak_since) * 1e-6 > how.patience else "weak", FEW
+        if self.weak_since is None:
+            self.weak_since, self.rested = time, 0
+        return "lost" if (time - self.weak_since - self.rested) * 1e-6 > how.patience else "weak", FEW
 
     def _near(self, site: Site, window: Window, found: Step, row: int) -> Belief | None:
         """A camera that met too little is looked for around where it was expected."""
