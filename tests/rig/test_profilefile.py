@@ -1,6 +1,9 @@
 """Files of motions: what they say, and that whatever is wrong is told with its line."""
 
+import contextlib
 import math
+import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -95,6 +98,10 @@ def test_the_pattern_fits_on_a_short_axis(slider, written):
         ("{axis: x, sync: {from_m: 0.3, to_m: 0.3}}", "begins where it ends"),
         ("{axis: x, return: {v_mps: .inf}}", "no finite number"),
         ("{axis: x, dwell_s: -1}", "at least 0"),
+        ("{axis: x, dwell_s: 1e9}", "at most 3600"),
+        ("{axis: x, cruise: {v_mps: -1e14, hold_s: 1e14}}", "at most 3600"),
+        ("{axis: x, together: [{axis: x, dwell_s: 1}]}", "unknown key axis"),
+        ("{repeat: {times: 2, steps: [{axis: x, dwell_s: 1}]}, dwell_s: 3}", "unknown key dwell_s"),
         ("together: [{axis: x, dwell_s: 1}, {axis: x, dwell_s: 1}]", "every axis once"),
         ("together: []", "no list of anything"),
         ("repeat: {times: 10000, steps: []}", "no list of anything"),
@@ -109,3 +116,50 @@ def test_what_is_wrong_is_told_with_its_line(slider, written, step, told):
     assert told in str(caught.value)
     assert str(caught.value).startswith(f"{path}, line 3: ")
     assert "what to do: " in str(caught.value)
+
+
+def test_steps_that_hold_themselves_are_refused(slider, tmp_path):
+    file = tmp_path / "profile.yaml"
+    for times in (1, 2):
+        file.write_text(f"profile: &a [{{repeat: {{times: {times}, steps: *a}}}}]")
+        with pytest.raises(Refused, match="steps that hold themselves"):
+            load_profile(file, slider)
+
+
+HOUR = ["repeat: {times: 37, steps: [{axis: x, move: {to_m: 0.3, v_mps: 0.5}}, {axis: x, dwell_s: 100}, {axis: x, return: {v_mps: 0.5}}]}"]
+
+
+@pytest.mark.parametrize(
+    ("steps", "told"),
+    [
+        (HOUR, "longer than 3600 s"),
+        (["{axis: x, move: {to_m: 0.7, v_mps: 2.1e-4}}", "{axis: x, dwell_s: 300}"], "longer than 3600 s"),
+        (["{axis: x, cruise: {v_mps: 1e14, hold_s: 3}}", "{axis: x, return: {v_mps: 1}}"], "longer than 3600 s"),
+        (["{axis: x, move: {to_m: 1e14, v_mps: 1e14}}"], "beyond what its drive can count"),
+    ],
+)
+def test_what_is_too_long_is_refused_before_it_is_sampled(slider, written, monkeypatch, steps, told):
+    monkeypatch.delattr("torchcmax.rig.plan.samples")
+    with pytest.raises(Refused, match=told):
+        plan(slider, load_profile(written(*steps), slider))
+
+
+NUMBERS = ["1e-300", "1e-14", "-1", "0", "1e-3", "1e6", "1e14", "1e300", ".nan", "!!float x", "!!null [1]", "&a [*a]", "true", "~"]
+TEXT = """profile:
+  - {axis: x, move: {to_m: 0.3, v_mps: 0.5, a_mps2: 2, j_mps3: 50}}
+  - {axis: x, sync: {from_m: 0.2, to_m: 0.25, v_mps: 0.5, a_mps2: 3}}
+  - {axis: x, pass: {x0_m: 0.12, x1_m: 0.3, v_mps: 1.0, a_mps2: 10, settle_s: 0.05}}
+  - {axis: x, cruise: {v_mps: 0.2, hold_s: 0.5, a_mps2: 4}}
+"""
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_whatever_a_number_is_the_profile_is_planned_or_refused(slider, tmp_path, monkeypatch, number):
+    """Each number of a file in turn; no warning either."""
+    monkeypatch.setattr("torchcmax.rig.plan.LONGEST", 5.0)
+    file = tmp_path / "profile.yaml"
+    for place in re.finditer(r"(?<=: )[0-9.]+", TEXT):
+        file.write_text(TEXT[: place.start()] + number + TEXT[place.end() :])
+        with warnings.catch_warnings(), contextlib.suppress(Refused):
+            warnings.simplefilter("error")
+            plan(slider, load_profile(file, slider)).summary()

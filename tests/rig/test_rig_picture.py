@@ -43,6 +43,11 @@ def test_planned_and_measured_are_drawn_on_each_other(planned, slider, tmp_path)
     assert pixels(picture.repeats(slider, encoder, said["cycles"]), np.array([0x1F, 0x77, 0xB4])) > 20
 
 
+def test_the_plan_in_its_operating_range_has_one_colour(planned, slider):
+    """That of the legend; what comes late hides nothing that came before."""
+    assert pixels(picture.operating_range(slider, 0, planned.samples), np.array([0x17, 0x64, 0xAB])) > 3000
+
+
 def test_what_is_outside_of_the_operating_range_is_red(planned, slider):
     inside = pixels(picture.operating_range(slider, 0, planned.samples), RED)
     faster = replace(planned.samples, **{name: 1.7 * getattr(planned.samples, name) for name in ("v", "torque", "current")})
@@ -57,7 +62,9 @@ def test_red_is_what_the_plan_refuses(slider, tmp_path):
         for peak in (2.0, 2.9, 4.0):
             rig = replace(slider, supply=float(supply), axes=(replace(slider.axes[0], current_peak=peak),))
             found = plan(rig, load_profile(file, rig))
-            margin = min(c.margin / c.limit for c in found.checks if c.name in ("voltage at the hot winding", "current", "motor's speed"))
+            margin = min(
+                c.margin / c.limit for c in found.checks if c.name in ("voltage, its winding hot or cold", "current", "motor's speed")
+            )
             red = picture.outside(rig, 0, found.samples).any()
             if abs(margin) > 0.02:  # samples lie beside the corners that are checked
                 assert red == (margin < 0), (supply, peak)

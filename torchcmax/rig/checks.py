@@ -8,14 +8,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 from scipy.signal import lfilter
 
-from torchcmax.rig.axis import RPM, quantum
+from torchcmax.rig.axis import RPM, motor_torque, quantum, to_motor
 from torchcmax.rig.config import UNITS, Axis, Rig
-from torchcmax.rig.demand import Samples, needed
-from torchcmax.rig.motors import voltage
+from torchcmax.rig.demand import Samples, either_way, needed
+from torchcmax.rig.motors import current, voltage
 from torchcmax.rig.profiles import Sequence
 
 REACTION = 0.1  # s that pass before a quick stop begins
@@ -24,6 +25,7 @@ COOLER = 10.0  # K below what the winding bears
 LOAD = 0.6  # of the bus
 PDOS = (5, 8, 8)  # bytes that a drive sends at every SYNC
 EXACT = 1e-9  # relative: what counts as equal
+PARTS = 32  # of a time between two corners, by which energies are summed
 INSIDE = 1e-9  # of a piece: so far from its ends are its corners, that there is a velocity
 
 Track = Sequence  # an axis' whole cycle, of trapezoids and rests
@@ -67,7 +69,7 @@ def check(rig: Rig, tracks: tuple[Track, ...], samples: Samples, strange: list[i
         if cycles > 1:
             gap = abs(samples.x[-1, k] - samples.x[0, k])
             found.append(_most(axis.name, "way left to the begin", gap, abs(quantum(axis)), UNITS[axis.kind].place, samples.time[-1]))
-    return (*found, *_rig(rig, every, samples))
+    return (*found, *_rig(rig, tracks, every, cycles))
 
 
 def corners(axis: Axis, track: Track) -> Corners:
@@ -104,22 +106,27 @@ def _motor(rig: Rig, axis: Axis, at: Corners, samples: Samples, k: int) -> list[
     motor, most = axis.motor, partial(_most, axis.name)
     speed, _, amperes = needed(axis, at.v, at.a)
     hot = samples.temperature[:, k]
-    volts = voltage(motor, amperes, speed, hot.max())
+    volts = voltage_needed(rig, axis, speed, amperes, hot.max())
     braking = needed(axis, at.v, -np.sign(at.v) * axis.limits.quick_stop)[2] * (at.v != 0)
     mean = np.sqrt(np.mean(np.square(samples.torque[:-1, k])))
-    lasting = _lasting(samples.current[:-1, k], rig.bus.sync_period / motor.winding_time)
+    lasting = _lasting(samples.current[:-1, k], samples.step / motor.winding_time)
     end = samples.time[-1]
     return [
         most("motor's speed", abs(speed) / RPM, motor.max_speed / RPM, "rpm", at.time),
         most("transmission's input speed", abs(speed) / RPM, axis.transmission.max_input_speed / RPM, "rpm", at.time),
         most("encoder's edges", abs(at.v / quantum(axis)), EDGES, "1/s", at.time),
-        most("voltage at the hot winding", abs(volts), rig.modulation * rig.supply, "V", at.time),
+        most("voltage, its winding hot or cold", volts, rig.modulation * rig.supply, "V", at.time),
         most("current", abs(amperes), axis.current_peak, "A", at.time),
         most("current of a quick stop", abs(braking), axis.current_peak, "A", at.time),
         most("mean current (rms)", lasting, motor.nominal_current, "A", samples.time[:-1]),
         most("mean torque (rms)", mean, motor.nominal_torque, "Nm", end),
         most("winding's temperature", hot, motor.winding_max - COOLER, "°C", samples.time),
     ]
+
+
+def voltage_needed(rig: Rig, axis: Axis, speed: np.ndarray, amperes: np.ndarray, hottest: float) -> np.ndarray:
+    """V, either way: driving a hot winding, or one that brakes while it is cold."""
+    return np.asarray(np.max([abs(voltage(axis.motor, amperes, speed, temperature)) for temperature in (rig.ambient, hottest)], 0))
 
 
 def _lasting(current: np.ndarray, share: float) -> np.ndarray:
@@ -133,32 +140,55 @@ def _lasting(current: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(np.sqrt(once + left))
 
 
-def _rig(rig: Rig, every: list[Corners], samples: Samples) -> list[Check]:
-    """What the axes share: supply and bus.  The supply takes nothing back, its capacitors do until the axes need it again."""
-    given = (samples.returned.sum(1) * rig.bus.sync_period).cumsum()
-    stored = given - np.minimum.accumulate(given.clip(max=0))
-    stops = [_quick_stop(axis, at, samples.temperature[0, k]) for k, (axis, at) in enumerate(zip(rig.axes, every, strict=True))]
+def _rig(rig: Rig, tracks: tuple[Track, ...], every: list[Corners], cycles: int) -> list[Check]:
+    """What the axes share: supply and bus."""
+    ends = np.unique(np.concatenate([at.time for at in every]))
+    time = np.interp(np.arange(PARTS * len(ends)) / PARTS, np.arange(len(ends)), ends)
+    states = [track.sample(time) for track in tracks]
+    stored = np.zeros_like(time)
+    for axes in product(*map(either_way, rig.axes)):
+        power = [_returned(axis, state.v, state.a, rig.ambient) for axis, state in zip(axes, states, strict=True)]
+        given = _integral(np.sum(power, 0), time)
+        left = _kept(given)[-1] if cycles > 1 else 0.0  # by the cycle before
+        stored = np.maximum(stored, _kept(given, left))
+    stopped = np.sum([_stopped(axis, state.v, rig.ambient) for axis, state in zip(rig.axes, states, strict=True)], 0)
 
-    def volts(energy: np.ndarray | float) -> np.ndarray:
-        return np.sqrt(rig.supply**2 + 2 * np.asarray(energy) / rig.bus_capacitance)
+    def volts(energy: np.ndarray) -> np.ndarray:
+        return np.sqrt(rig.supply**2 + 2 * energy / rig.bus_capacitance)
 
     return [
-        _most("", "supply's voltage in braking", volts(stored), rig.bus_max, "V", samples.time),
-        _most("", "supply's voltage in a quick stop", volts(sum(energy for energy, _ in stops)), rig.bus_max, "V", max(stops)[1]),
+        _most("", "supply's voltage in braking", volts(stored), rig.bus_max, "V", time),
+        _most("", "supply's voltage in a quick stop", volts(stored + stopped), rig.bus_max, "V", time),
         _most("", "load of the CAN bus", 100 * can_load(rig), 100 * LOAD, "%", 0.0),
     ]
 
 
-def _quick_stop(axis: Axis, at: Corners, temperature: float) -> tuple[float, float]:
-    """The most energy that a quick stop gives back, J, and when it would begin."""
-    part = np.linspace(1, 0, 65)[:, None]
-    v = part * at.v
-    speed, _, amperes = needed(axis, v, -np.sign(at.v) * axis.limits.quick_stop)
-    power = -voltage(axis.motor, amperes, speed, temperature) * amperes
-    dt = abs(at.v) / axis.limits.quick_stop / (len(part) - 1)
-    energy = ((power[1:] + power[:-1]) / 2 * dt).cumsum(0).max(0).clip(0)
-    k = int(energy.argmax())
-    return float(energy[k]), float(at.time[k])
+def _returned(axis: Axis, v: np.ndarray, a: np.ndarray, temperature: float) -> np.ndarray:
+    """Power that a motor gives back to its supply, W: the most, its winding as cold as it begins.  At rest friction may hold the axis."""
+    speed = to_motor(axis, v)
+    amperes = current(axis.motor, motor_torque(axis, v, a), speed)
+    return np.asarray(np.where(v == 0, 0.0, -voltage(axis.motor, amperes, speed, temperature) * amperes))
+
+
+def _stopped(axis: Axis, v: np.ndarray, temperature: float) -> np.ndarray:
+    """Energy that quick stops from velocities v give back at most, J."""
+    speed, slower = np.linspace(0, abs(v).max(), 8 * PARTS), axis.limits.quick_stop
+
+    def energy(way: int) -> np.ndarray:
+        power = [_returned(one, way * speed, np.full_like(speed, -way * slower), temperature) for one in either_way(axis)]
+        return np.asarray(np.interp(way * v, speed, _kept(_integral(np.max(power, 0), speed / slower))))
+
+    return np.asarray(energy(1) + energy(-1))
+
+
+def _integral(power: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Energy given since the begin."""
+    return np.append(0.0, ((power[1:] + power[:-1]) / 2 * np.diff(time)).cumsum())
+
+
+def _kept(given: np.ndarray, begin: float = 0.0) -> np.ndarray:
+    """What of it the capacitors hold, which held so much in the begin: the supply takes nothing back, axes take from them first."""
+    return np.asarray(given - np.minimum.accumulate(np.minimum(given, -begin)))
 
 
 def can_load(rig: Rig) -> float:

@@ -20,7 +20,8 @@ from torchcmax.rig.section import Section, read
 
 BITRATES = ("10000", "20000", "50000", "125000", "250000", "500000", "800000", "1000000")  # CiA 301
 HOMING = (-4, -3, -2, -1, 1, 2, 7, 11, 17, 18, 23, 27, 33, 34, 35, 37)  # methods of the EPOS drives
-COUNTS = 2**31 - 1  # quadcounts that a drive's position holds
+COUNTS = 2**31 - 1  # quadcounts, rpm and rpm/s that a drive's objects hold
+CURRENT = (0.01, 65.0)  # A, likewise
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def load(path: str | Path) -> Rig:
 
 
 def _bus(section: Section) -> Bus:
-    period, heartbeat = section.number("sync_period_s", least=1e-3, most=0.1), section.number("heartbeat_s", least=1e-3, most=1)
+    period, heartbeat = section.number("sync_period_s", least=1e-3, most=5e-3), section.number("heartbeat_s", least=1e-3, most=1)
     return Bus(
         interface=section.text("interface"),
         channel=section.text("channel"),
@@ -226,15 +227,15 @@ def _axis(file: Path, node: yaml.Node) -> Axis:
     encoder = section.section("encoder", "cpt invert")
     load = section.section("load", f"{unit.load} coulomb_{unit.force} gravity_{unit.force}")
     axis = Axis(
-        name=section.text("name"),
+        name=section.word("name"),
         kind=_literal(kind),
         direction=_direction(section),
         point=_three(section.numbers("point_m", 3)) if "point_m" in section else (0.0, 0.0, 0.0),
         family=_literal(drive.choice("family", "epos2", "epos4")),
-        node_id=drive.whole("node_id", 1, 127),
+        node_id=drive.whole("node_id", 1, 126),
         serial=drive.whole("serial", 0, 2**32 - 1) if "serial" in drive else None,
         motor=_motor(winding),
-        current_peak=winding.number("current_peak_a", above=0),
+        current_peak=winding.number("current_peak_a", least=CURRENT[0], most=CURRENT[1]),
         cpt=encoder.whole("cpt", 1, 2**20),
         invert=encoder.flag("invert"),
         transmission=_transmission(section, unit),
@@ -250,11 +251,21 @@ def _axis(file: Path, node: yaml.Node) -> Axis:
 
 
 def _fits(section: Section, axis: Axis) -> None:
-    """What concerns more than one section of an axis."""
-    limits, home = axis.limits, axis.homing
-    turns = max(abs(limits.min), abs(limits.max)) / axis.transmission.travel * axis.transmission.ratio
-    if not turns * 4 * axis.cpt < COUNTS:
+    """What concerns more than one section of an axis, as drives are told it in whole numbers."""
+    limits, home, turn = axis.limits, axis.homing, axis.transmission.travel / axis.transmission.ratio
+    if not max(abs(limits.min), abs(limits.max)) / turn * 4 * axis.cpt < COUNTS:
         raise section.wrong("limits", "reach beyond what the drive can count", f"at most {COUNTS} quadcounts from zero")
+    if not 1 <= limits.following / turn * 4 * axis.cpt < COUNTS:
+        raise section.wrong("limits", "want a following error that the drive cannot count", f"from 1 to {COUNTS} quadcounts")
+    for part, name, value in (
+        ("limits", "speed", limits.v),
+        ("limits", "change in a second", limits.a),
+        ("limits", "quick stop in a second", limits.quick_stop),
+        ("homing", "speed", home.speed),
+    ):
+        if not 1 <= value / turn * 60 <= COUNTS:
+            told = f"has a {name} of {value / turn * 60:.3g} rpm of the motor"
+            raise section.wrong(part, told, f"drives are told whole numbers from 1 to {COUNTS}")
     if not limits.min <= home.offset <= limits.max:
         raise section.wrong("homing", "puts home outside of the limits", "offset is where the axis stands after homing")
     if home.speed > limits.v:
@@ -271,7 +282,7 @@ def _transmission(axis: Section, unit: Unit) -> Transmission:
         travel=section.number(unit.travel, above=0) if unit.travel else 2 * math.pi,
         backlash=section.number(f"backlash_{unit.place}", least=0) * unit.scale,
         inertia=section.number("inertia_kgm2", least=0) if "inertia_kgm2" in section else 0.0,
-        max_input_speed=section.number("input_speed_max_rpm", above=0) * math.pi / 30,
+        max_input_speed=section.number("input_speed_max_rpm", least=1, most=COUNTS) * math.pi / 30,
     )
 
 

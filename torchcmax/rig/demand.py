@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from torchcmax.rig.motors import current, voltage
 from torchcmax.rig.profiles import Profile
 from torchcmax.rig.thermal import TwoBody
 
+FINE = 1e-3  # s: samples are no farther apart
 HOTTEST = 1e6  # °C: of a motor that runs away
 
 
@@ -29,36 +31,40 @@ class Samples:
     temperature: np.ndarray
 
     @property
-    def returned(self) -> np.ndarray:
-        """Power that the motors give back to their supply [K, axes], W."""
-        return np.asarray(-self.voltage * self.current)
+    def step(self) -> float:
+        return float(self.time[1])
+
+    def every(self, count: int) -> Samples:
+        """Only every so many."""
+        return Samples(*(getattr(self, each.name)[::count] for each in fields(self)))
 
 
 def samples(rig: Rig, tracks: tuple[Profile, ...], duration: float, cycles: int) -> Samples:
-    """At every SYNC of the last of so many cycles, in which the motors are hottest."""
-    period = rig.bus.sync_period
-    time = np.arange(round(duration / period) + 1) * period
+    """At every SYNC, and between them where these are far apart, of the last of so many cycles, in which the motors are hottest."""
+    step = rig.bus.sync_period / math.ceil(rig.bus.sync_period / FINE - 1e-9)
+    time = np.arange(round(duration / step) + 1) * step
     columns = []
     for axis, track in zip(rig.axes, tracks, strict=True):
         state = track.sample(time)
         speed, torque, amperes = needed(axis, state.v, state.a)
-        temperature = _heated(TwoBody(axis.motor, rig.ambient), amperes, speed, period, cycles)
+        temperature = _heated(TwoBody(axis.motor, rig.ambient), amperes, speed, step, cycles)
         volts = voltage(axis.motor, amperes, speed, temperature)
         columns.append((state.x, state.v, state.a, torque, amperes, volts, temperature))
     return Samples(time, *(np.stack(parts, 1) for parts in zip(*columns, strict=True)))
 
 
 def needed(axis: Axis, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Velocity and acceleration of the axis -> the motor's speed rad/s, torque Nm and current A.
-
-    The gravity of a rotary axis may act either way, as its angle is: the larger torque counts.
-    """
-    torque = motor_torque(axis, v, a)
-    if axis.kind == "rotary":
-        other = motor_torque(replace(axis, gravity=-axis.gravity), v, a)
-        torque = np.where(abs(other) > abs(torque), other, torque)
+    """Velocity and acceleration of the axis -> the motor's speed rad/s, torque Nm and current A: the most, whichever way gravity acts."""
     speed = to_motor(axis, v)
-    return speed, torque, current(axis.motor, torque, speed)
+    torque = np.stack([motor_torque(one, v, a) for one in either_way(axis)])
+    amperes = current(axis.motor, torque, speed)
+    worst = abs(amperes).argmax(0)[None]
+    return speed, np.take_along_axis(torque, worst, 0)[0], np.take_along_axis(amperes, worst, 0)[0]
+
+
+def either_way(axis: Axis) -> tuple[Axis, ...]:
+    """An axis as its gravity may act: that of a rotary one both ways, as its angle is."""
+    return (axis,) if axis.kind == "linear" else (axis, replace(axis, gravity=-axis.gravity))
 
 
 def _heated(body: TwoBody, amperes: np.ndarray, speed: np.ndarray, dt: float, cycles: int) -> np.ndarray:

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchcmax.rig.axis import RPM, to_motor
-from torchcmax.rig.checks import EXACT
+from torchcmax.rig.checks import EXACT, voltage_needed
 from torchcmax.rig.config import Axis, Rig
 from torchcmax.rig.demand import Samples
-from torchcmax.rig.motors import available_speed, continuous_torque, no_load_current, voltage
+from torchcmax.rig.motors import available_speed, continuous_torque, no_load_current
 from torchcmax.rig.record import Encoder
 from torchcmax.rig.thermal import TwoBody
 
@@ -112,10 +112,9 @@ def operating_range(rig: Rig, k: int, samples: Samples) -> bytes:
     panel.plot(np.stack([-peak - lost, peak - lost], 1) * 1e3, speed / RPM, color=LIMIT, ls="--", lw=1,
                label=[f"peak current, {axis.current_peak:g} A", None])  # fmt: skip
     panel.axhline(fastest / RPM, color=LIMIT, ls="-.", lw=1, label="fastest of motor and transmission")
-    path = panel.scatter(pull * 1e3, turns / RPM, c=samples.time, s=6, cmap="viridis", zorder=3, label="plan")
+    panel.scatter(pull * 1e3, turns / RPM, color=MEASURED, s=6, zorder=3, label="plan")
     refused = outside(rig, k, samples)
     panel.scatter(pull[refused] * 1e3, turns[refused] / RPM, color=LIMIT, s=16, marker="x", zorder=4)
-    figure.colorbar(path, ax=panel, label="time, s")
     top = 1.1 * max(fastest, turns.max()) / RPM
     panel.set(xlabel="torque, mNm; negative: it brakes", ylabel="speed, rpm", xlim=(-most * 1e3, most * 1e3), ylim=(0, top))
     panel.set_title(f"axis {axis.name}: {motor.family} {motor.part}" + (f", {refused.sum()} samples outside" if refused.any() else ""))
@@ -124,10 +123,10 @@ def operating_range(rig: Rig, k: int, samples: Samples) -> bytes:
 
 
 def outside(rig: Rig, k: int, samples: Samples) -> np.ndarray:
-    """Which samples [K] want more current, voltage at the plan's hottest winding, or speed than there is, as the plan's checks have it."""
+    """Which samples [K] want more current, voltage, or speed than there is, as the plan's checks have it."""
     axis = rig.axes[k]
     speed, amperes = to_motor(axis, samples.v[:, k]), samples.current[:, k]
-    volts = voltage(axis.motor, amperes, speed, samples.temperature[:, k].max())
+    volts = voltage_needed(rig, axis, speed, amperes, samples.temperature[:, k].max())
     wanted = np.abs([amperes, volts, speed])
     there_is = np.array([axis.current_peak, rig.modulation * rig.supply, _fastest(axis)])[:, None]
     return np.asarray((wanted > there_is * (1 + EXACT)).any(0))

@@ -12,13 +12,14 @@ import numpy as np
 from torchcmax.rig import profiles, program
 from torchcmax.rig.axis import Chain, drivable, from_quadcounts, quadcounts, quantum
 from torchcmax.rig.checks import Check, Track, check
-from torchcmax.rig.config import Axis, Rig
+from torchcmax.rig.config import COUNTS, Axis, Bus, Rig
 from torchcmax.rig.demand import Samples, samples
 from torchcmax.rig.errors import Refused
 from torchcmax.rig.profiles import Dwell, Profile, cruise, rise
 from torchcmax.rig.program import Program
 
-REST = 0.02  # s between two moves of an axis: for the drive's hand-shake, and for it to say that it has arrived
+REST, REST_SYNCS = 0.02, 10  # s, SYNCs, the longer of which lies between two moves of an axis
+LONGEST = 3600.0  # s, of one cycle
 APPROACH = 0.25  # of the limits, with which an axis goes to where the next step begins
 
 Step = Mapping[int, Profile]  # what axes do, by their index in the rig, beginning on one SYNC
@@ -77,9 +78,15 @@ def plan(rig: Rig, steps: Sequence[Step], cycles: int = 1) -> Plan:
     moves = tuple(sorted(layout.moves, key=lambda move: (move.start, move.axis)))
     told = Program(moves, tuple(layout.begin), layout.now)
     tracks = layout.tracks()
-    found = samples(rig, tracks, told.duration, cycles)
-    checks = check(rig, tracks, found, layout.strange, cycles)
+    finely = samples(rig, tracks, told.duration, cycles)
+    checks = check(rig, tracks, finely, layout.strange, cycles)
+    found = finely.every(round(rig.bus.sync_period / finely.step))
     return Plan(rig, told, tracks, found, cycles, checks, _image_speed(rig, found))
+
+
+def rest(bus: Bus) -> float:
+    """s between two moves of an axis: for the drive's hand-shake, for it to say that it has arrived, and for its mode to change."""
+    return max(REST, REST_SYNCS * bus.sync_period)
 
 
 class _Layout:
@@ -113,7 +120,7 @@ class _Layout:
             time, last, free = self.now, 0.0, self.now
             for offset, move in profile.moves:
                 time, last = self._ceil(max(time + offset - last, free)), offset
-                free = time + self._move(k, time, move) + REST
+                free = time + self._move(k, time, move) + rest(self.rig.bus)
             ends.append(max(free, time + profile.duration - last))
         self.now = self._ceil(max(ends))
 
@@ -145,12 +152,16 @@ class _Layout:
 
     def _ceil(self, time: float) -> float:
         """The next SYNC."""
+        if not time <= LONGEST:
+            raise Refused(f"the profile is longer than {LONGEST:g} s\n  what to do: move faster or rest less; run --repeat repeats it")
         period = self.rig.bus.sync_period
         return math.ceil(time / period - 1e-6) * period
 
 
 def _counted(axis: Axis, x: float) -> float:
     """To whole quadcounts."""
+    if not abs(x) <= COUNTS * abs(quantum(axis)):
+        raise Refused(f"axis {axis.name}: {x:.4g} is beyond what its drive can count\n  what to do: stay within its limits")
     return float(from_quadcounts(axis, quadcounts(axis, x))) + 0.0  # -0.0 is 0.0
 
 

@@ -24,7 +24,8 @@ from pathlib import Path
 import yaml
 
 from torchcmax.rig.config import UNITS, Rig, Unit
-from torchcmax.rig.plan import REST, Step
+from torchcmax.rig.errors import Refused
+from torchcmax.rig.plan import LONGEST, Step, rest
 from torchcmax.rig.profiles import Dwell, Move, Profile, constant_pass, cruise, sync
 from torchcmax.rig.section import LARGEST, Section, read
 
@@ -36,7 +37,10 @@ def load_profile(path: str | Path, rig: Rig) -> tuple[Step, ...]:
     """The steps of a YAML file for a rig; Refused with the line, what is wrong and what to do."""
     top, _ = read(Path(path), "profile")
     reader = _Reader(rig, top.file)
-    reader.steps(top.items("profile"))
+    try:
+        reader.steps(top.items("profile"))
+    except RecursionError as error:
+        raise Refused(f"{top.file}: has steps that hold themselves\n  what to do: write them out, without & and *") from error
     return tuple(reader.found)
 
 
@@ -56,11 +60,11 @@ class _Reader:
             if len(self.found) >= MOST:
                 raise step.refused(f"these are more than {MOST} steps", "repeat less often")
             if "repeat" in step:
-                again = step.section("repeat", "times steps")
+                again = Section(self.file, "step", node, "repeat").section("repeat", "times steps")
                 for _ in range(again.whole("times", 1, MOST)):
                     self.steps(again.items("steps"))
             elif "together" in step:
-                parts = [self._part(part) for part in step.items("together")]
+                parts = [self._part(part) for part in Section(self.file, "step", node, "together").items("together")]
                 if len({axis for axis, _ in parts}) < len(parts):
                     raise step.wrong("together", "wants every axis once", "give each axis one motion")
                 self._add(dict(parts))
@@ -87,7 +91,7 @@ class _Reader:
         limits, unit = self.rig.axes[axis].limits, UNITS[self.rig.axes[axis].kind]
         here = self.place.get(axis, self.rig.axes[axis].homing.offset)
         if kind == "dwell_s":
-            return Dwell(here, step.number("dwell_s", least=0))
+            return Dwell(here, step.number("dwell_s", least=0, most=LONGEST))
         v, a, j = f"v_{unit.rate}", f"a_{unit.rate}2", f"j_{unit.rate}3"
         if kind == "sync":
             given = step.section(kind, "", f"from_{unit.place} to_{unit.place} {v} {a}")
@@ -108,11 +112,11 @@ class _Reader:
         if kind == "cruise":
             if not speed:
                 raise given.wrong(v, "is 0", "give the velocity, with its sign, or dwell_s to rest")
-            return cruise(here, speed, acceleration, given.number("hold_s", least=0))
+            return cruise(here, speed, acceleration, given.number("hold_s", least=0, most=LONGEST))
         x0, x1 = (given.number(f"{end}_{unit.place}") * unit.scale for end in ("x0", "x1"))
         if x0 == x1:
             raise given.refused("the pass begins where it ends", "give two places")
-        settle = given.number("settle_s", least=0) if "settle_s" in given else 0.05
+        settle = given.number("settle_s", least=0, most=LONGEST) if "settle_s" in given else 0.05
         return constant_pass(x0, x1, speed, acceleration, jerk, settle)
 
     def _sync(self, given: Section, axis: int, v: float, a: float) -> Profile:
@@ -123,7 +127,7 @@ class _Reader:
         begin, end = _or(given, near, middle - length / 2, unit, False), _or(given, far, middle + length / 2, unit, False)
         if begin == end:
             raise given.refused("the pattern begins where it ends", "give two places")
-        return sync(begin, end, v, a, REST)
+        return sync(begin, end, v, a, rest(self.rig.bus))
 
 
 def _or(given: Section, key: str, otherwise: float, unit: Unit, positive: bool = True) -> float:

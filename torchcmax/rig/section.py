@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from torchcmax.rig.errors import Refused
 NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float", "tag:yaml.org,2002:str")  # YAML 1.1 takes 1e3 for text
 TEXT = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:int")  # part numbers are written without quotation marks too
 NULL = "tag:yaml.org,2002:null"
-LARGEST = 1e15
+WORD = re.compile("[A-Za-z0-9_-]{1,32}")
+LARGEST = 1e15  # of numbers; what is below 1e-15 is taken for 0
 
 
 class Section:
@@ -27,9 +29,9 @@ class Section:
             raise self.refused(f"{name} is no mapping", f"write {name}: {{{', '.join(wanted or known)}}}")
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.value not in known:
-                near = get_close_matches(str(key.value), known, 1)
+                near = get_close_matches(_shown(key), known, 1)
                 hint = f"did you mean {near[0]}?" if near else f"the keys of {name} are {', '.join(known) or 'none'}"
-                raise self.refused(f"unknown key {key.value} in {name}", hint, key)
+                raise self.refused(f"unknown key {_shown(key)} in {name}", hint, key)
             if key.value in self.entries:
                 raise self.refused(f"{key.value} is there twice in {name}", "keep one of them", key)
             self.entries[key.value] = value
@@ -86,10 +88,18 @@ class Section:
         return tuple(self._number(key, node) for node in nodes)
 
     def text(self, key: str) -> str:
+        """A line of text."""
         node = self.entries[key]
-        if not isinstance(node, yaml.ScalarNode) or node.tag not in TEXT or not node.value:
-            raise self.wrong(key, "is no text", f'write {key}: "..."')
+        if not isinstance(node, yaml.ScalarNode) or node.tag not in TEXT or not node.value or not node.value.isprintable():
+            raise self.wrong(key, "is no text of one line", f'write {key}: "..."')
         return str(node.value)
+
+    def word(self, key: str) -> str:
+        """What can stand in names of files and columns of tables."""
+        value = self.text(key)
+        if not WORD.fullmatch(value):
+            raise self.wrong(key, f"is {value}", "it wants letters of the alphabet, digits, _ and -, at most 32 of them")
+        return value
 
     def choice(self, key: str, *known: str) -> str:
         value = self.text(key)
@@ -98,10 +108,10 @@ class Section:
         return value
 
     def flag(self, key: str) -> bool:
-        node = self.entries[key]
-        if node.tag != "tag:yaml.org,2002:bool":
-            raise self.wrong(key, f"is {node.value}", "it wants true or false")
-        return bool(yaml.SafeLoader("").construct_yaml_bool(node))
+        node, known = self.entries[key], yaml.SafeLoader.bool_values
+        if node.tag != "tag:yaml.org,2002:bool" or _shown(node).lower() not in known:
+            raise self.wrong(key, f"is {_shown(node)}", "it wants true or false")
+        return bool(known[_shown(node).lower()])
 
     def _number(self, key: str, node: yaml.Node) -> float:
         try:
@@ -109,9 +119,13 @@ class Section:
         except ValueError:
             value = math.nan
         if not abs(value) < LARGEST:
-            shown = node.value if isinstance(node, yaml.ScalarNode) else "a mapping or a list"
-            raise self.wrong(key, f"is {shown}, no finite number", "it wants a decimal number in the unit that the key names")
-        return value
+            raise self.wrong(key, f"is {_shown(node)}, no finite number", "it wants a decimal number in the unit that the key names")
+        return value if abs(value) > 1 / LARGEST else 0.0
+
+
+def _shown(node: yaml.Node) -> str:
+    """For messages."""
+    return str(node.value) if isinstance(node, yaml.ScalarNode) else "a mapping or a list"
 
 
 def read(path: Path, required: str, optional: str = "") -> tuple[Section, bytes]:
@@ -123,6 +137,8 @@ def read(path: Path, required: str, optional: str = "") -> tuple[Section, bytes]
         raise Refused(f"{path}: cannot be read: {error.strerror}\n  what to do: name a YAML file, see configs/rig") from error
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is no text in UTF-8\n  what to do: name a YAML file, see configs/rig") from error
+    except RecursionError as error:
+        raise Refused(f"{path}: is nested too deeply\n  what to do: begin from a file of configs/rig") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f"{path}, line {mark.line + 1}" if mark else f"{path}"
