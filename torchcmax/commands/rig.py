@@ -174,11 +174,11 @@ def _plan(config: Namespace) -> None:
 
 
 def _run(config: Namespace) -> None:
-    from torchcmax.rig.runner import run
-
     out = folder(config.out)
     _armed(config)
     try:
+        from torchcmax.rig.runner import run
+
         plan = _planned(config)
     except KeyboardInterrupt:
         rigtruth.clear(out, rigtruth.OF_RUNS)  # who goes on with this folder takes it for this run's
