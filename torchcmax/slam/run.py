@@ -319,7 +319,8 @@ class Run:
         status, reason = self._status(site, strength if fits else 0.0, unsure, seen.time)
         self.adrift = None if status == "ok" else self.adrift
         if reason == FEW:  # keep to what was predicted, or to where it is found near, which is believed when the next window fits there
-            self.belief = self._near(site, seen.window, found, row) or found.before[row : row + 1]
+            met = found.after if self._meets(site, strength) else found.before
+            self.belief = self._near(site, seen.window, found, row) or met[row : row + 1]
         sight = self._refined(site, seen.window, before, reason)
         if sight is None or status == "lost":
             yield from self.blind(seen, ALONG if sight is None else reason)
@@ -344,10 +345,14 @@ class Run:
         glimpse = Glimpse.of(window, motion, there.normal, self.sensor, self.border)
         return self._grid(site).judge(glimpse, state) >= self.options.relocalizing.accept
 
+    def _meets(self, site: Site, strength: float) -> bool:
+        """Whether a window meets as many edges as is usual."""
+        return not site.usual or strength > self.options.sensing.weak * median(site.usual)
+
     def _status(self, site: Site, strength: float, unsure: float, time: int) -> tuple[Status, str]:
         """Of a window that was tracked, and why it is not ok."""
         how = self.options.sensing
-        if not site.usual or strength > how.weak * median(site.usual):
+        if self._meets(site, strength):
             site.usual.append(strength)
             self.weak_since, self.rested = None, 0
             if not unsure >= how.certain:
