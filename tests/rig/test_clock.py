@@ -234,3 +234,17 @@ def test_rest_and_little_are_refused():
     assert "saw 20 windows" in align(driven, seen[np.arange(20)], "velocity").reason
     assert not align(driven, seen[np.arange(60)], "velocity").accepted
     assert ClockModel(1.0, 1e-6, 0, 0, "velocity", 1).accepted
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_pattern_tells_the_offset_also_where_passes_are_repeated(slider, seed):
+    """configs/rig/slider_pass.yaml: two passes, which fit one after the other too, and leave the pattern unexplained then."""
+    from torchcmax.rig.plan import plan
+    from torchcmax.rig.profilefile import load_profile
+
+    samples = plan(slider, load_profile("configs/rig/slider_pass.yaml", slider)).samples
+    driven = Driven(samples.time, samples.v[:, :1], samples.x[:, 0])
+    model = align(driven, velocities(np.random.default_rng(seed), driven, 3.0), "velocity")
+    model.demand()
+    assert model.peak_to_side > 0.4
+    assert abs(off(model, driven, 3.0)) < 0.5e-3

@@ -161,7 +161,8 @@ def _interpolated(time: np.ndarray, driven: Driven, path: np.ndarray) -> np.ndar
 def _first(driven: Driven, seen: Seen, method: Method) -> tuple[float, float]:
     """Offset at which what the drives did and what the camera saw correlate best, on a grid; and by which share others do less.
 
-    The share is negative where the opposite motion would correlate better.
+    Whatever the camera saw counts for every offset, also before and after the run, where the drives rested: a part of the run that is
+    repeated fits elsewhere too, and leaves the rest unexplained.  The share is negative where the opposite motion would correlate better.
     """
     start = driven.time[0]
     edges = np.arange(start, driven.time[-1] + STEP, STEP)
@@ -183,7 +184,7 @@ def _first(driven: Driven, seen: Seen, method: Method) -> tuple[float, float]:
         mean_done, mean_saw = common(done, count) / n, common(ones, saw) / n
         product, driven2, seen2 = product - n * mean_done * mean_saw, driven2 - n * mean_done**2, seen2 - n * mean_saw**2
     enough = (driven2 > SHARE * driven2.max()) & (seen2 > SHARE * seen2.max())
-    score = np.where(enough, product / np.sqrt(np.where(enough, driven2 * seen2, 1.0)), 0.0)
+    score = np.where(enough, product / np.sqrt(np.where(enough, driven2 * seen2.max(), 1.0)), 0.0)
     best = int(score.argmax())
     peaks = find_peaks(np.concatenate([[0.0], score, [0.0]]), prominence=PROMINENCE)[0] - 1
     side = max(score[peaks[peaks != best]].max(initial=0.0), -score.min() if method == "velocity" else 0.0)
