@@ -139,6 +139,7 @@ def test_each_limit_of_the_rest_alone(slider):
     fails(plan(changed(slider, cpt=3200), PASS), "encoder")
     fails(plan(replace(slider, modulation=of(good, "voltage").value / 24 * 0.999), PASS), "voltage")
     fails(plan(changed(slider, "limits", quick_stop=40.0), PASS), "current of a quick stop")
+    fails(plan(changed(changed(slider, current_peak=40.0), "limits", quick_stop=150.0), PASS), "voltage of a quick stop")
     fails(plan(changed(slider, "motor", winding_max=float(good.samples.temperature.max()) + 9.99), PASS), "winding")
     most = of(good, "supply's voltage in braking").value - 0.01
     fails(plan(replace(slider, bus_max=most), PASS), "supply's voltage in braking", "supply's voltage in a quick stop")
@@ -326,9 +327,11 @@ def test_no_accepted_plan_exceeds_a_limit_anywhere(slider, pantilt, turns, drawn
             (k, "voltage", np.abs(volts).max(), 0.9 * 24),
         ]
         given.append([np.interp(grid, t, energy(back(axis, gravity, v, a, 25.0), t)) for gravity in gravities(axis)])
-        v = np.interp(grid, t, v) * np.linspace(1, 0, 65)[:, None]
-        dt = abs(v[0]) / limits.quick_stop / 64
-        power = [back(axis, gravity, v, -np.sign(v) * limits.quick_stop, 25.0) for gravity in gravities(axis)]
+        v = np.interp(grid, t, v) * np.linspace(1, 1e-6, 65)[:, None]
+        dt, slower = abs(v[0]) / limits.quick_stop / 64, -np.sign(v) * limits.quick_stop
+        amperes = np.stack([electric(axis, gravity, v, slower)[0] for gravity in gravities(axis)])
+        values.append((k, "current of a quick stop", abs(amperes).max(), axis.current_peak))
+        power = [back(axis, gravity, v, slower, 25.0) for gravity in gravities(axis)]
         stop += np.max([((p[1:] + p[:-1]) / 2 * dt).cumsum(0).max(0).clip(0) for p in power], 0)
     stored = np.max([kept(np.sum(parts, 0)) for parts in product(*given)], 0)
     for k, name, value, limit in values:

@@ -107,7 +107,9 @@ def _motor(rig: Rig, axis: Axis, at: Corners, samples: Samples, k: int) -> list[
     speed, _, amperes = needed(axis, at.v, at.a)
     hot = samples.temperature[:, k]
     volts = voltage_needed(rig, axis, speed, amperes, hot.max())
-    braking = needed(axis, at.v, -np.sign(at.v) * axis.limits.quick_stop)[2] * (at.v != 0)
+    stops = [needed(axis, part * at.v, -np.sign(at.v) * axis.limits.quick_stop) for part in (1, INSIDE)]  # as they begin and end
+    braking = np.max([abs(taken) for _, _, taken in stops], 0)
+    stopping = np.max([voltage_needed(rig, axis, turns, taken, hot.max()) for turns, _, taken in stops], 0)
     mean = np.sqrt(np.mean(np.square(samples.torque[:-1, k])))
     lasting = _lasting(samples.current[:-1, k], samples.step / motor.winding_time)
     end = samples.time[-1]
@@ -117,7 +119,8 @@ def _motor(rig: Rig, axis: Axis, at: Corners, samples: Samples, k: int) -> list[
         most("encoder's edges", abs(at.v / quantum(axis)), EDGES, "1/s", at.time),
         most("voltage, its winding hot or cold", volts, rig.modulation * rig.supply, "V", at.time),
         most("current", abs(amperes), axis.current_peak, "A", at.time),
-        most("current of a quick stop", abs(braking), axis.current_peak, "A", at.time),
+        most("current of a quick stop", braking, axis.current_peak, "A", at.time),
+        most("voltage of a quick stop", stopping, rig.modulation * rig.supply, "V", at.time),
         most("mean current (rms)", lasting, motor.nominal_current, "A", samples.time[:-1]),
         most("mean torque (rms)", mean, motor.nominal_torque, "Nm", end),
         most("winding's temperature", hot, motor.winding_max - COOLER, "°C", samples.time),
