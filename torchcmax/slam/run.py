@@ -60,11 +60,12 @@ class TooShort(ValueError):
 
 @dataclass(frozen=True)
 class Gathered:
-    """A window that waits for a plane, with what it shows alone; the number of its placement."""
+    """A window that waits for a plane, with what it shows alone; the number of its placement; the share of events that are no noise."""
 
     window: Window
     front: Front
     number: int
+    supported: float
 
 
 class Run:
@@ -144,7 +145,7 @@ class Run:
             return
         self.motion = alone.motion
         if self.options.atlas or not self.sites:
-            self.gathered.append(Gathered(window, alone, number))
+            self.gathered.append(Gathered(window, alone, number, seen.supported))
         full = max(len(self.gathered), len(self.early)) >= self.options.mapping.first
         if self._seek(window, alone.motion, WALL.normal) or (early and self.given is not None and full):
             yield from self._early_tracks()  # it is on the given map, or not near where that was drawn from
@@ -154,7 +155,7 @@ class Run:
     def _begin(self) -> Iterator[Track]:
         """The gathered windows make a first plane and map."""
         how, model = self.options.mapping, self.options.model
-        gathered, self.gathered = self.gathered, []
+        gathered, self.gathered = self._moving(self.gathered), []
         windows, motions = [g.window for g in gathered], [g.front.motion for g in gathered]
         free = (model != "translation", model != "rotation")
         solved = rebased(first_plane(windows, motions, self.canvas.focal, how, free=free).frames)
@@ -178,6 +179,14 @@ class Run:
         self.belief = Belief(torch.tensor([keyframes[-1].time]), last if rests else keyframes[-1].state, covariance_of(FIRST_SIGMA))
         self._anew(self.site)
         yield from self._early_tracks()
+
+    def _moving(self, gathered: list[Gathered]) -> list[Gathered]:
+        """Without those at the end that the camera mostly rests in: a map would take the little that they show for any motion."""
+        usual = self.options.sensing.weak * median(g.supported for g in gathered)
+        last = max(i for i, g in enumerate(gathered) if g.supported >= usual)
+        for g in gathered[last + 1 :]:
+            self.placements[g.number].status = "still"
+        return gathered[: last + 1]
 
     def _early_tracks(self) -> Iterator[Track]:
         """What was kept back is told."""
