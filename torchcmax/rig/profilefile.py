@@ -11,7 +11,7 @@
 
 Units are those of the axis, as in the rig's file.  Motions take a_mps2 too, else the axis' limit, sync half of it; pass and move take
 j_mps3, which no drive's profile mode runs.  An axis whose first step says no other place begins at its home; one that stands elsewhere than
-its next step begins goes there first, with a quarter of its limits.
+its next step begins goes there first, with a quarter of its limits.  A profile lasts an hour at most.
 """
 
 from __future__ import annotations
