@@ -147,17 +147,20 @@ def test_home_is_found_from_anywhere(slider, tmp_path, place):
         assert drive.state is State.DISABLED
 
 
-@pytest.mark.parametrize("method", [18, 35])
+@pytest.mark.parametrize("method", [18, 35, -3, -4])
 def test_home_by_other_methods(slider, tmp_path, method):
     from dataclasses import replace
 
     axis = slider.axes[0]
-    rig = replace(slider, axes=(replace(axis, homing=replace(axis.homing, method=method, offset=0.7)),))
+    rig = replace(
+        slider, axes=(replace(axis, homing=replace(axis.homing, method=method, offset=0.7, current=1.0 if method < 0 else None)),)
+    )
     with rig_on_bus(rig) as simulation:
         home(rig, tmp_path, simulate=True, network=simulation.host)
         (drive,) = simulation.drives
         assert drive.position * 6.25e-6 == pytest.approx(0.7, abs=QC * 6.25e-6)
-        assert method == 35 or abs(drive.position - drive.plant.place / drive.count) <= QC
+        off = {-3: -0.0154, -4: 0.0154}.get(method, 0.0) / 6.25e-6  # m: the mechanical stops are 2 % of the way beyond the limits
+        assert method == 35 or abs(drive.position - drive.plant.place / drive.count - off) <= (20 if off else QC)
 
 
 def test_a_run_leaves_drives_that_the_next_finds_well(slider, tmp_path):

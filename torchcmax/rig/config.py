@@ -19,6 +19,7 @@ from torchcmax.rig.motors import Motor, motor
 from torchcmax.rig.section import Section, read
 
 BITRATES = ("10000", "20000", "50000", "125000", "250000", "500000", "800000", "1000000")  # CiA 301
+PUSHING = (-4, -3, -2, -1)  # those that drive onto a mechanical stop
 HOMING = (-4, -3, -2, -1, 1, 2, 7, 11, 17, 18, 23, 27, 33, 34, 35, 37)  # methods of the EPOS drives
 COUNTS = 2**31 - 1  # quadcounts, rpm and rpm/s that a drive's objects hold
 CURRENT = (0.01, 65.0)  # A, likewise
@@ -58,11 +59,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Homing:
-    """CiA 402 method | speed m/s, rad/s | offset: the position of home, m, rad."""
+    """CiA 402 method | speed m/s, rad/s | offset: the position of home, m, rad | current A, of methods that push onto a stop, else None."""
 
     method: int
     speed: float
     offset: float
+    current: float | None = None
 
 
 @dataclass(frozen=True)
@@ -268,6 +270,8 @@ def _fits(section: Section, axis: Axis) -> None:
             raise section.wrong(part, told, f"drives are told whole numbers from 1 to {COUNTS}")
     if not limits.min <= home.offset <= limits.max:
         raise section.wrong("homing", "puts home outside of the limits", "offset is where the axis stands after homing")
+    if home.current is not None and home.current > min(axis.motor.nominal_current, axis.current_peak):
+        raise section.wrong("homing", "pushes with more than the motor's nominal current", f"at most {axis.motor.nominal_current:g} A")
     if home.speed > limits.v:
         raise section.wrong("homing", "is faster than the axis may be", "lower its speed")
 
@@ -303,12 +307,16 @@ def _limits(axis: Section, unit: Unit) -> Limits:
 
 
 def _homing(axis: Section, unit: Unit) -> Homing:
-    section = axis.section("homing", f"method speed_{unit.rate} offset_{unit.place}")
+    section = axis.section("homing", f"method speed_{unit.rate} offset_{unit.place}", "current_a")
     method = section.whole("method", min(HOMING), max(HOMING))
     if method not in HOMING:
         raise section.wrong("method", f"is {method}", f"the drives know {', '.join(map(str, HOMING))}")
+    if (method in PUSHING) != ("current_a" in section):
+        remedy = f"methods {min(PUSHING)} to {max(PUSHING)} want the current, A, at which a stop is reached; no others do"
+        raise section.wrong("current_a", "and method do not go together", remedy)
+    current = section.number("current_a", least=CURRENT[0], most=CURRENT[1]) if "current_a" in section else None
     speed = section.number(f"speed_{unit.rate}", above=0) * unit.scale
-    return Homing(method, speed, section.number(f"offset_{unit.place}") * unit.scale)
+    return Homing(method, speed, section.number(f"offset_{unit.place}") * unit.scale, current)
 
 
 def _motor(section: Section) -> Motor:

@@ -73,7 +73,7 @@ OBJECTS = [value for value in globals().values() if isinstance(value, Object)]
 class Drive:
     """What differs between families.  nominal_current mA, peak_current mA, thermal_time 0.1 s, max_speed rpm, home: its position, qc
 
-    home_move: qc, by which an axis would still move away from where it found home
+    home_move: qc, by which an axis would still move away from where it found home | home_current mA, by which it finds a stop
     status: what is told beside the statusword; an EPOS2 tells errors by emergency messages alone
     optional: settings that not every firmware has
     """
@@ -88,6 +88,7 @@ class Drive:
     max_speed: Object
     home: Object
     home_move: Object
+    home_current: Object
     soft_limit: int
     limit_switch: int
     status: tuple[Object, ...]
@@ -102,10 +103,11 @@ class Drive:
 FAMILIES: dict[str, Drive] = {
     "epos4": Drive("EPOS4", Object(0x30D1, 2, "i32"), Object(0x60F4, 0, "i32"), Object(0x3001, 1, "u32"), Object(0x3001, 2, "u32"),
                    Object(0x3001, 3, "u8"), Object(0x3001, 4, "u16"), Object(0x6080, 0, "u32"), Object(0x30B0, 0, "i32"),
-                   Object(0x30B1, 0, "i32"), 0x8A82, 0x8A80, (MODE_SHOWN, ERROR_CODE), ()),
+                   Object(0x30B1, 0, "i32"), Object(0x30B2, 0, "u16"), 0x8A82, 0x8A80, (MODE_SHOWN, ERROR_CODE), ()),
     "epos2": Drive("EPOS2", Object(0x6078, 0, "i16"), Object(0x20F4, 0, "i16"), Object(0x6410, 1, "u16"), Object(0x6410, 2, "u16"),
                    Object(0x6410, 3, "u8"), Object(0x6410, 5, "u16"), Object(0x6410, 4, "u32"), Object(0x2081, 0, "i32"),
-                   Object(0x607C, 0, "i32"), 0xFF09, 0xFF06, (MODE_SHOWN,), (ABORT_OPTION, QUICK_STOP_OPTION, FAULT_OPTION)),
+                   Object(0x607C, 0, "i32"), Object(0x2080, 0, "u16"), 0xFF09, 0xFF06,
+                   (MODE_SHOWN,), (ABORT_OPTION, QUICK_STOP_OPTION, FAULT_OPTION)),
 }  # fmt: skip
 
 PROFILE_POSITION, PROFILE_VELOCITY_MODE, HOMING = 1, 3, 6
@@ -243,10 +245,15 @@ def settings(axis: Axis, timeout: float) -> dict[Object, int]:
         HOMING_METHOD: axis.homing.method,
         HOMING_SPEED: max(1, abs(rpm(axis, axis.homing.speed))),
         HOMING_SLOWLY: max(1, abs(rpm(axis, axis.homing.speed / 5))),
-        HOMING_ACCELERATION: abs(rpm(axis, drivable(axis, limits.a))),
+        HOMING_ACCELERATION: max(1, abs(rpm(axis, drivable(axis, gentle(axis))))),
         drive.home: {-1: ends[0] + INSIDE, 1: ends[1] - INSIDE}.get(homing_end(axis), int(quadcounts(axis, axis.homing.offset))),
         drive.home_move: 0,
-    }
+    } | ({} if axis.homing.current is None else {drive.home_current: round(axis.homing.current * 1e3)})
+
+
+def gentle(axis: Axis) -> float:
+    """Acceleration of an axis that goes at the speed of homing: 50 ms to reach it, and less than a current of a stop."""
+    return min(axis.limits.a, axis.limits.quick_stop, 20 * axis.homing.speed)
 
 
 def homing_end(axis: Axis) -> int:

@@ -333,9 +333,7 @@ class Session:
     def go(self, places: tuple[float, ...]) -> None:
         """All axes to their places, slowly: at the speed of homing."""
         moves = [
-            Move(
-                TURN * self.period, i, "position", x, axis.homing.speed, min(axis.limits.a, axis.limits.quick_stop, 20 * axis.homing.speed)
-            )
+            Move(TURN * self.period, i, "position", x, axis.homing.speed, o.gentle(axis))
             for i, (axis, x) in enumerate(zip(self.rig.axes, places, strict=True))
         ]
         far = max(abs(d.place - x) / d.axis.homing.speed for d, x in zip(self.drives, places, strict=True))

@@ -395,14 +395,19 @@ class SimulatedDrive:
             method = self.get(o.HOMING_METHOD)
             if method in (35, 37):
                 self._home()
-            elif method in (17, 18):
+            elif method in (17, 18, -3, -4):
                 self.phase = "seeking"
-                self.ramp = self.ramp.at((-1 if method == 17 else 1) * self._rate(o.HOMING_SPEED), self._rate(o.HOMING_ACCELERATION))
+                self.ramp = self.ramp.at((-1 if method in (17, -4) else 1) * self._rate(o.HOMING_SPEED), self._rate(o.HOMING_ACCELERATION))
             else:
                 self.phase = "failed"
 
     def _seek(self) -> None:
-        """Towards the limit switch, and slowly off it again: where it opens is home."""
+        """Towards the limit switch, and slowly off it again: where it opens is home.  Or until a stop takes the current for it."""
+        if self.get(o.HOMING_METHOD) < 0:
+            if abs(self.plant.current) * 1e3 >= self.get(self.family.home_current):
+                self.ramp = Ramp(self.plant.place, 0.0)
+                self._home()
+            return
         way = -1 if self.get(o.HOMING_METHOD) == 17 else 1
         closed = (self.plant.place / self.count - self.get(self.family.home)) * way >= 0
         if self.phase == "seeking" and closed:
