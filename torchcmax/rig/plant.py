@@ -14,6 +14,7 @@ SUBSTEPS = 8  # of the physics, in a period of the SYNC
 STOP = 0.02  # of an axis' way, beyond its limits: where its mechanical ends are
 BANDWIDTH = 2 * math.pi * 25  # rad/s, of the servo
 SLACK = 1e-9  # rad/s: slower is at rest
+NEAR = 2  # quadcounts from where it should rest, within which the servo integrates no more: friction would wind it up
 
 
 @dataclass
@@ -85,6 +86,7 @@ class Plant:
         self.ends = sorted((self.ratio * (axis.limits.min - room), self.ratio * (axis.limits.max + room)))
         self.rotor = axis.motor.inertia + axis.transmission.inertia
         self.inertia = self.rotor + axis.load / self.ratio**2
+        self.count = 2 * math.pi / (4 * axis.cpt)  # rad of the motor per quadcount
         self._error = 0.0
 
     def follow(self, place: float, velocity: float, acceleration: float, seen: float, dt: float) -> float:
@@ -95,7 +97,8 @@ class Plant:
         torque += self.needed(velocity, acceleration)
         asked = torque / self.motor.torque_constant + self._no_load(velocity)
         peak = self.axis.current_peak
-        if abs(asked) < peak:  # else it would wind up
+        rests = velocity == acceleration == 0 and abs(error) < NEAR * self.count
+        if abs(asked) < peak and not rests:  # else it would wind up
             self._error += error * dt
         return max(-peak, min(peak, asked))
 
