@@ -185,15 +185,20 @@ def test_a_run_whose_bus_cannot_be_opened_leaves_nothing_of_an_older_one(older, 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["plan.plan", "picture.motion"])
-def test_who_stops_it_while_planning_or_drawing_leaves_nothing_of_an_older_run(number, name, older, profile, capsys, monkeypatch):
+def test_who_stops_it_while_planning_loses_nothing_and_while_drawing_has_nothing_of_an_older_run(
+    number, name, older, profile, capsys, monkeypatch
+):
     module, name = name.split(".")
     hit(monkeypatch, import_module(f"torchcmax.rig.{module}"), name, sent(number))
-    before = signal.getsignal(signal.SIGTERM)
+    before, whole = signal.getsignal(signal.SIGTERM), {path.name: path.read_bytes() for path in older.iterdir()}
     status, _, err = said(capsys, "run", SLIDER, profile, "--dry-run", "-o", older, "--quiet")
     assert status == 5
     assert "stopped by the user" in err
-    assert not left(older) & OF_THE_RUN
-    assert said(capsys, "truth", older)[0] == 2
+    if module == "plan":
+        assert {path.name: path.read_bytes() for path in older.iterdir()} == whole
+    else:
+        assert not left(older) & OF_THE_RUN
+        assert said(capsys, "truth", older)[0] == 2
     assert signal.getsignal(signal.SIGTERM) == before
 
 

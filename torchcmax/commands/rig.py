@@ -176,13 +176,9 @@ def _plan(config: Namespace) -> None:
 def _run(config: Namespace) -> None:
     out = folder(config.out)
     _armed(config)
-    try:
-        from torchcmax.rig.runner import run
+    from torchcmax.rig.runner import run
 
-        plan = _planned(config)
-    except KeyboardInterrupt:
-        rigtruth.clear(out, rigtruth.OF_RUNS)  # who goes on with this folder takes it for this run's
-        raise
+    plan = _planned(config)
     plan.refuse()
     _begin(out, config)
     with rigtruth.kept(out, plan.rig, config.dry_run, plan.samples):
@@ -253,7 +249,9 @@ def _table(plan: Plan) -> str:
     for check in plan.checks:
         numbers = f"{check.value:10.4g} {check.limit:10.4g} {check.unit:8} {check.margin:10.4g} {check.time:8.3f}"
         lines.append(f"{check.axis or 'rig':8} {check.name:40} {numbers}  {'' if check.ok else 'NOT KEPT'}".rstrip())
-    lines.append(f"{len(plan.program.moves)} moves in {plan.program.duration:.3f} s; {plan.cycles} times")
+    lines.append(
+        f"{len(plan.program.moves)} moves in {plan.program.duration:.3f} s; {'once' if plan.cycles == 1 else f'{plan.cycles} times'}"
+    )
     if plan.image_speed is not None:
         lines.append(f"the image moves at up to {plan.image_speed:.0f} px/s")
     return "\n".join(lines)
