@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,7 @@ from torchcmax.rig.profilefile import load_profile
 from torchcmax.rig.program import Move, Program
 from torchcmax.rig.record import read_encoder
 from torchcmax.rig.runner import check, home, run, watch_encoders
+from torchcmax.rig.simnode import SimulatedDrive
 
 QC = 2  # quadcounts within which an axis stands where it should
 
@@ -149,8 +151,6 @@ def test_home_is_found_from_anywhere(slider, tmp_path, place):
 
 @pytest.mark.parametrize("method", [18, 35, -3, -4])
 def test_home_by_other_methods(slider, tmp_path, method):
-    from dataclasses import replace
-
     axis = slider.axes[0]
     rig = replace(
         slider, axes=(replace(axis, homing=replace(axis.homing, method=method, offset=0.7, current=1.0 if method < 0 else None)),)
@@ -255,8 +255,6 @@ def test_check_reads_and_writes_nothing(slider, pantilt):
 
 
 def test_both_families_are_driven(slider, tmp_path):
-    from dataclasses import replace
-
     older = replace(slider, axes=(replace(slider.axes[0], family="epos2"),))
     with rig_on_bus(older) as simulation:
         said = run(older, program(), tmp_path, simulate=True, network=simulation.host)
@@ -315,3 +313,33 @@ def test_a_host_that_stalls_is_noticed_by_the_drive(slider, tmp_path):
 
         with pytest.raises(DriveFault, match="heartbeat"):
             run(slider, program(), tmp_path, simulate=True, watch=stall, network=simulation.host)
+
+
+def test_a_bus_with_threads_that_the_host_opens_itself(slider, tmp_path, monkeypatch):
+    """As a real one: drives that answer when they come to it, and what is received in another thread.  Of a machine that may be busy."""
+    import canopen
+
+    monkeypatch.setattr(session, "STALL", 5.0)
+    monkeypatch.setattr(session, "LOST", (5, 2.0))
+    bus = replace(slider.bus, interface="virtual", channel=str(tmp_path), sync_period=0.005, heartbeat_timeout=1.0)
+    rig = replace(slider, rate=200.0, bus=bus)
+    network = canopen.Network()
+    network.connect(interface=bus.interface, channel=bus.channel)
+    try:
+        drive = SimulatedDrive(network, rig, rig.axes[0], 0.02)
+        home(rig, tmp_path / "home", simulate=False, arm=True)
+        assert drive.homed
+        moves = (
+            Move(0.0, 0, "velocity", 0.16, 0.3, 3.0),
+            Move(0.2, 0, "velocity", 0.16, 0.0, 3.0),
+            Move(0.6, 0, "position", 0.1, 0.3, 3.0),
+        )
+        said = run(rig, Program(moves, (0.1,), 1.0), tmp_path / "run", simulate=False, arm=True)
+    finally:
+        network.disconnect()
+    assert said["status"] == "complete"
+    assert drive.state is State.DISABLED
+    assert drive.position * 6.25e-6 == pytest.approx(0.1, abs=QC * 6.25e-6)
+    encoder = read_encoder(tmp_path / "run" / "encoder.csv", rig)
+    assert encoder.place[:, 0].max() == pytest.approx(0.16, abs=0.05)  # farther by 0.3 m/s where the drive's time, of SYNCs, went slower
+    assert encoder.time[-1] > 1.0
