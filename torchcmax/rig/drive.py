@@ -88,20 +88,20 @@ class Drive:
     def _on_pdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
         """In the thread that receives: may not raise, as canopen would only log that.
 
-        An answer begins with the first PDO, which goes first over the bus: what comes without it belongs to the SYNC before.
+        An answer begins with the first PDO, which goes first over the bus: what comes without it belongs to one that was not whole.
         """
         try:
             pdo = self._tells[can_id]
             values = pdo.unpack(bytes(data))
             if pdo.number == 1:
                 self._parts = {}
-            parts = self._parts
-            if pdo.number != 1 and 1 not in parts:
+            elif 1 not in self._parts:
                 return
-            parts[pdo.number] = values
+            self._parts[pdo.number] = values
             if o.POSITION in pdo.entries:
                 self._stamp = timestamp
-            if len(parts) == len(self._tells):
+            if len(self._parts) == len(self._tells):
+                parts, self._parts = self._parts, {}
                 word, mode, error = (*parts[1], 0)[:3]
                 (place, speed), (current, following) = parts[2], parts[3]
                 self.told, self.complete = Told(word, mode, error, place, speed, current, following, self._stamp), True
@@ -113,8 +113,8 @@ class Drive:
         self.emergency = message.code if message.code >= 0x100 else 0
 
     def expect(self) -> None:
-        """What it tells from now on is its answer to the next SYNC."""
-        self._parts, self.complete = {}, False
+        """What it has told when the next SYNC is over is its answer to that, or, where it is late, to the one before."""
+        self.complete = False
 
     def count(self) -> None:
         """Whether it has answered, and whether it stands."""
@@ -129,7 +129,7 @@ class Drive:
 
     def forget(self) -> None:
         """Whatever came before its PDOs were mapped."""
-        self.expect()
+        self._parts, self.complete = {}, False
         self.broken, self.missed, self.unanswered = None, 0, 0
 
     @property

@@ -32,6 +32,7 @@ FIRST_TIME, ENABLE_TIME, MODE_TIME, ANSWER_TIME, ARRIVE_TIME, HOME_TIME = 0.5, 5
 RESET_TIME, OFF_TIME, STAND_TIME = 0.5, 1.0, 0.01  # s
 BEYOND = {"linear": 1e-3, "rotary": math.radians(0.1)}  # of a soft limit, that the host does not accept
 FASTER, COOLER = 1.1, 5.0  # times the limit of the speed; K below the winding's limit: where the host stops
+ECHO = 10  # frames that an interface may still have to give back, where it does
 TURN = 4  # SYNCs before a move by which its mode is sent
 Watch = Callable[[int], object]
 
@@ -79,14 +80,14 @@ class Session:
         self.waiting: dict[int, tuple[bool, int]] = {}  # axes with a set point: whether its answer has to come or go, since when
         self.beaten = -math.inf  # s, when the last heartbeat was sent
         self.due = 0.0  # s, when the last SYNC was
-        self.foreign: str | None = None
+        self.sent, self.heard = {SYNC: 0, HEARTBEAT + o.MASTER: 0}, {SYNC: 0, HEARTBEAT + o.MASTER: 0}  # what this host alone may send
         self.bodies = [TwoBody(axis.motor, rig.ambient) for axis in rig.axes]
         self.warm = [(rig.ambient, rig.ambient) for _ in rig.axes]
         self.load = [0.0 for _ in rig.axes]  # mean square of the current, A^2
 
     def __enter__(self) -> Session:
-        for cob_id in (SYNC, HEARTBEAT + o.MASTER):
-            self.network.subscribe(cob_id, self._on_foreign)
+        for cob_id in self.sent:
+            self.network.subscribe(cob_id, self._on_own)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -94,14 +95,14 @@ class Session:
             if self.armed:
                 self._stop(error)
         finally:
-            for cob_id in (SYNC, HEARTBEAT + o.MASTER):
-                self.network.unsubscribe(cob_id, self._on_foreign)
+            for cob_id in self.sent:
+                self.network.unsubscribe(cob_id, self._on_own)
             for drive in self.drives:
                 drive.close()
 
-    def _on_foreign(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """What this host alone may send, from somebody else."""
-        self.foreign = "SYNCs" if can_id == SYNC else "the host's heartbeat"
+    def _on_own(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """From somebody else, or by an interface that gives back whatever is sent."""
+        self.heard[can_id] += 1
 
     @property
     def period(self) -> float:
@@ -118,8 +119,7 @@ class Session:
         self.before, self.k, self.ticks = self.k, self.k + 1, self.ticks + 1
         for drive in self.drives:
             drive.expect()
-        with bus():
-            self.network.sync.transmit()
+        self._say(SYNC, b"")
         self._answers()
         for drive in self.drives:
             drive.count()
@@ -166,19 +166,27 @@ class Session:
         now = time.monotonic() if self.paced else self.k * self.period
         if now >= self.beaten + self.rig.bus.heartbeat - self.period / 2:
             self.beaten = now
-            with bus():
-                self.network.send_message(HEARTBEAT + o.MASTER, bytes([OPERATIONAL]))
+            self._say(HEARTBEAT + o.MASTER, bytes([OPERATIONAL]))
+
+    def _say(self, cob_id: int, data: bytes) -> None:
+        self.sent[cob_id] += 1
+        with bus():
+            self.network.send_message(cob_id, data)
 
     def _check(self, drive: Drive) -> None:
         """What a drive tells, and what it leaves untold."""
         drive.check()
-        if self.foreign is not None:
-            raise DriveFault(f"somebody else on this bus sends {self.foreign}\n  what to do: end that program, or give the rig its own bus")
+        for cob_id, count in self.sent.items():
+            if self.heard[cob_id] > count or 0 < self.heard[cob_id] < count - ECHO:
+                remedy = "end that program, or give the rig its own bus"
+                raise DriveFault(
+                    f"somebody else on this bus sends {'SYNCs' if cob_id == SYNC else 'heartbeats'} as its host\n  what to do: {remedy}"
+                )
         if self.allowed is not None and drive.complete and drive.state is not self.allowed:
             remedy = "look for an input, a key or another program that commands the drive, and at safe torque off"
             raise DriveFault(f"{drive}: is {drive.says}, not {self.allowed.value}, and nobody asked for it\n  what to do: {remedy}")
         if drive.unanswered > MISSING[0] + MISSING[1] * self.ticks:
-            remedy = "look at cable, termination and the load of the bus"
+            remedy = "look at cable, termination and the load of the bus, or give it more time: sync_period_s"
             raise LinkLost(f"{drive}: has not answered {drive.unanswered} of {self.ticks} SYNCs\n  what to do: {remedy}")
 
     def _limit(self) -> None:
