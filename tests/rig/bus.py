@@ -7,17 +7,20 @@ import pytest
 
 pytest.importorskip("canopen", reason="the extra rig is not installed")
 
+from torchcmax.rig import drive as drives
 from torchcmax.rig import objects as o
-from torchcmax.rig import record, session
+from torchcmax.rig import session
 from torchcmax.rig.axis import reduction
 from torchcmax.rig.errors import Aborted, RigError
 from torchcmax.rig.objects import State
 from torchcmax.rig.program import Move, Program
 from torchcmax.rig.runner import run
-from torchcmax.rig.simnode import simulated
+from torchcmax.rig.simnode import SYNC, simulated
 
 EMERGENCY, STATUS, CONTROL, SDO = 0x80, 0x180, 0x200, 0x600
 STOPPING, SWITCHING = {o.QUICK, o.NO_VOLTAGE}, {o.SHUT_DOWN, o.SWITCH_ON, o.ENABLE, o.START, o.AT_ONCE}
+
+CRUISE = Program((Move(0.0, 0, "velocity", 0.1, 0.3, 3.0), Move(1.0, 0, "velocity", 0.4, 0.0, 3.0)), (0.1,), 1.3)
 
 
 class Ear:
@@ -132,32 +135,59 @@ def marked(simulation):
     simulation.mark = len(simulation.ear.frames)
 
 
+def metres(drive):
+    return drive.position * 6.25e-6
+
+
+def events(out):
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+def dropping(simulation, lost):
+    """Frames of the host that never arrive: lost(COB-ID, data) -> bool."""
+    send = simulation.host.send_message
+    simulation.host.send_message = lambda can_id, data, remote=False: None if lost(can_id, bytes(data)) else send(can_id, data, remote)
+
+
+def deaf(simulation, lost):
+    """Frames of drives that the host does not hear."""
+    hear = simulation.host.notify
+    simulation.host.notify = lambda can_id, data, stamp: None if lost(can_id, bytes(data)) else hear(can_id, data, stamp)
+
+
 class Clock:
     """The time of a host and of drives that go on by it, SYNC or no SYNC; only sleeping and `pass_` move it.
 
-    shift: s by which the interface's clock is ahead
+    shift: s by which the interface's clock is ahead | grain: s in which it goes on, 0 where it knows all
     """
 
     def __init__(self, monkeypatch, simulation):
-        self.now, self.shift = 100.0, 0.0
-        for module in (session, record):
+        self.now, self.shift, self.grain = 100.0, 0.0, 0.0
+        for module in (session, drives):
             monkeypatch.setattr(module, "time", self)
         hear = simulation.host.notify
-        simulation.host.notify = lambda can_id, data, timestamp: hear(can_id, data, self.now + self.shift)
+        simulation.host.notify = lambda can_id, data, timestamp: hear(can_id, data, self._stamp())
         for drive in simulation.drives:
-            drive._run = self._running(drive, drive._run)
+            drive.network.subscribers[SYNC].insert(0, self._running(drive, drive._run))
+            drive._run = lambda: None
 
     def _running(self, drive, run):
+        """Up to a SYNC, before the drive takes what comes with it."""
         begun = ran = self.now
 
-        def go_on():
+        def go_on(can_id, data, timestamp):
             nonlocal ran
-            for _ in range(max(1, round((self.now - ran) / drive.period))):
+            periods = round((self.now - ran) / drive.period)
+            for _ in range(periods):
                 run()
-            ran = self.now
-            drive.time = self.now - begun - drive.period  # its SYNC adds a period
+            ran += periods * drive.period
+            drive.time = self.now - begun
 
         return go_on
+
+    def _stamp(self):
+        stamp = self.now + self.shift
+        return stamp // self.grain * self.grain if self.grain else stamp
 
     def monotonic(self):
         return self.now

@@ -136,7 +136,7 @@ def test_the_bus_is_gone(slider, tmp_path, which):
         (Faults(vendor=0x1234), "its vendor is 0x1234"),
         (Faults(altered={o.SUPPORTED: 0b1}), "it has no mode profile velocity, homing|it has no mode homing"),
         (Faults(altered={o.VELOCITY_UNIT: 0x00B40300}), "its unit of velocity is 0x00B40300, not rpm"),
-        (Faults(altered={o.HIGHEST: 2**31 - 1}), "0x607D:02 was set to 120000 and reads 2147483647"),
+        (Faults(altered={o.HIGHEST: 2**31 - 1}), "0x607D:02 was set to 119999 and reads 2147483647"),
         (Faults(altered={o.Object(0x1601, 1, "u32"): 0x60400010}), "0x1601:01 was set to 1618608160 and reads 1614807056"),
         (Faults(altered={o.CONSUMER_HEARTBEAT: 0}), "0x1016:01 was set to 8323172 and reads 0"),
         (Faults(aborted={o.FOLLOWING_WINDOW: 0x06090031}), "0x6065:00 cannot be set to 480: .*0x06090031"),

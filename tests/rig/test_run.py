@@ -268,7 +268,8 @@ def test_both_families_are_driven(slider, tmp_path):
 
 @pytest.mark.parametrize(
     ("damage", "told"),
-    [(lambda s: "", "is no record"), (lambda s: s.replace("x,", "y,", 3), "is no record|do not fit"), (lambda s: s[:-20], "line"),
+    [(lambda s: "", "is no record"), (lambda s: s.splitlines()[0] + "\n", "holds no sample"),
+     (lambda s: s.replace("x,", "y,", 3), "is no record|do not fit"), (lambda s: s[:-20], "line"),
      (lambda s: s + s.splitlines()[5] + "\n", "not in order"), (lambda s: s.replace(",16000,", ",nan,", 1), "not finite")],
 )  # fmt: skip
 def test_damaged_records_are_refused(passed, slider, tmp_path, damage, told):

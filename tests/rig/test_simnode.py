@@ -20,7 +20,7 @@ def simulation(slider):
 @pytest.fixture
 def host(simulation, slider):
     made = Drive(simulation.host, slider.axes[0], slider.bus.sync_period)
-    made.configure(0.1)
+    made.configure(0.1, homing=False)
     return made
 
 
@@ -79,10 +79,10 @@ def test_what_a_drive_would_send_by_itself_is_off(host):
 
 def test_firmware_may_say_of_remote_frames_what_it_likes(simulation, host):
     simulation.drives[0].faults.altered[Object(0x1800, 1, "u32")] = 0x181
-    host.configure(0.1)
+    host.configure(0.1, homing=False)
     simulation.drives[0].faults.altered[Object(0x1800, 1, "u32")] = 0x182
     with pytest.raises(Refused, match="0x1800:01 was set to"):
-        host.configure(0.1)
+        host.configure(0.1, homing=False)
 
 
 def test_a_disabled_drive_notices_the_silence_of_the_host_too(simulation, host):

@@ -1,12 +1,14 @@
 """One drive as the host sees it: its dictionary by SDO, its commands and what it tells by PDO.
 
-The CiA 402 state machine is walked here and in runner.py, one controlword at a time: canopen's own profile sends controlwords that nobody
+The CiA 402 state machine is walked here and in session.py, one controlword at a time: canopen's own profile sends controlwords that nobody
 asked for (with a mode; after a reset), and swallows what goes wrong.
 """
 
 from __future__ import annotations
 
 import struct
+import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -22,7 +24,8 @@ from torchcmax.rig.objects import FAMILIES, Object, Pdo, State
 from torchcmax.rig.program import Move
 
 GONE = (can.CanError, OSError, RuntimeError)  # python-can's errors, those of adapters that were unplugged, and canopen's of no connection
-STEADY = 2  # quadcounts by which an axis that stands may still waver
+STEADY = (2, 0.05)  # quadcounts, and part of its following error, the larger of which an axis that stands may still waver by
+RECENT = 10  # answers, whose mean is a velocity
 STANDS = 2.0  # rpm of the motor
 
 
@@ -37,7 +40,8 @@ def bus() -> Iterator[None]:
 
 
 class Told(NamedTuple):
-    """What a drive told with a SYNC, in its units: quadcounts, rpm, mA.  stamp: s by the interface's clock, when its position came."""
+    """What a drive told with a SYNC, in its units: quadcounts, rpm, mA.  stamp, heard: s by the interface's and the host's clock, when its
+    position came."""
 
     statusword: int = 0
     mode: int = 0
@@ -47,12 +51,14 @@ class Told(NamedTuple):
     current: int = 0
     following: int = 0
     stamp: float = 0.0
+    heard: float = 0.0
 
 
 class Drive:
     """The drive of an axis on a network, and what it answers to SYNCs, one every `period` s.
 
     complete: whether it answered the last SYNC | missed: SYNCs that it has not answered, one after the other, and unanswered: in all
+    silent: numbers of the SYNCs that it left unanswered lately | speeds: that it told lately, rpm
     steady: SYNCs for which its position has not changed | emergency: code of its last emergency message, until it takes that back
     broken: what went wrong while an answer was received
     """
@@ -65,10 +71,13 @@ class Drive:
         self.pdos = o.pdos(axis.family)
         self.told, self.complete = Told(), False
         self.missed = self.unanswered = self.steady = self.emergency = 0
+        self.silent: deque[int] = deque()
+        self.speeds: deque[int] = deque(maxlen=RECENT)
         self.broken: Exception | None = None
         self._stands = 0  # quadcounts, about which it wavers
+        self._wavers = max(STEADY[0], STEADY[1] * abs(int(quadcounts(axis, axis.limits.following))))
         self._parts: dict[int, tuple[int, ...]] = {}
-        self._stamp = 0.0
+        self._stamp = self._heard = 0.0
         self._tells = {pdo.base + axis.node_id: pdo for pdo in self.pdos if pdo.send and pdo.entries}
         for cob_id in self._tells:
             network.subscribe(cob_id, self._on_pdo)
@@ -99,12 +108,13 @@ class Drive:
                 return
             self._parts[pdo.number] = values
             if o.POSITION in pdo.entries:
-                self._stamp = timestamp
+                self._stamp, self._heard = timestamp, time.monotonic()
             if len(self._parts) == len(self._tells):
                 parts, self._parts = self._parts, {}
                 word, mode, error = (*parts[1], 0)[:3]
                 (place, speed), (current, following) = parts[2], parts[3]
-                self.told, self.complete = Told(word, mode, error, place, speed, current, following, self._stamp), True
+                self.told = Told(word, mode, error, place, speed, current, following, self._stamp, self._heard)
+                self.complete = True
         except Exception as error:
             self.broken = error
 
@@ -116,21 +126,28 @@ class Drive:
         """What it has told when the next SYNC is over is its answer to that, or, where it is late, to the one before."""
         self.complete = False
 
-    def count(self) -> None:
-        """Whether it has answered, and whether it stands."""
+    def count(self, k: int) -> None:
+        """Whether it has answered SYNC k, and whether it stands."""
         if not self.complete:
             self.missed += 1
             self.unanswered += 1
+            self.silent.append(k)
             return
         self.missed = 0
+        self.speeds.append(self.told.velocity)
         self.steady += 1
-        if abs(self.told.position - self._stands) > STEADY:
+        if abs(self.told.position - self._stands) > self._wavers:
             self._stands, self.steady = self.told.position, 0
 
     def forget(self) -> None:
         """Whatever came before its PDOs were mapped."""
-        self._parts, self.complete = {}, False
-        self.broken, self.missed, self.unanswered = None, 0, 0
+        self._parts, self.complete, self.broken = {}, False, None
+        self.pardon()
+
+    def pardon(self) -> None:
+        """What it left unanswered so far."""
+        self.missed = self.unanswered = 0
+        self.silent.clear()
 
     @property
     def state(self) -> State | None:
@@ -154,10 +171,18 @@ class Drive:
         """m/s or rad/s."""
         return o.from_rpm(self.axis, self.told.velocity)
 
+    @property
+    def mean_speed(self) -> float:
+        """Of its latest answers, m/s or rad/s: one alone is as rough as its encoder."""
+        return o.from_rpm(self.axis, sum(self.speeds) / max(1, len(self.speeds)))
+
     def arrived(self, move: Move | None) -> bool:
-        """Whether it says so, is no faster than its encoder tells from rest within a SYNC, and is where a move should have brought it."""
+        """Whether it says so, is no faster than its encoder tells from rest within a SYNC, and is where a move should have brought it.
+
+        Where there was no move yet, what it says of one means nothing.
+        """
         there = move is None or move.kind == "velocity" or abs(self.place - move.target) <= self.axis.limits.following
-        return self.shows(o.ARRIVED) and abs(self.told.velocity) <= self.slow and there
+        return (move is None or self.shows(o.ARRIVED)) and abs(self.told.velocity) <= self.slow and there
 
     # -- its dictionary
 
@@ -211,9 +236,15 @@ class Drive:
         """Codes of its last errors, latest first."""
         return [self.read(Object(0x1003, sub, "u32")) & 0xFFFF for sub in range(1, self.read(o.ERROR_COUNT) + 1)]
 
-    def configure(self, timeout: float) -> dict[str, int]:
-        """Write limits, supervision and the PDO mapping, and read all of it back; Refused where anything differs."""
+    def configure(self, timeout: float, homing: bool) -> dict[str, int]:
+        """Write limits, supervision and the PDO mapping, and read all of it back; Refused where anything differs.
+
+        homing: home is going to be found, and the one before is not to be believed from the first write on, however that ends.  The upper
+        soft limit says so: it is one quadcount lower until `found_home`.
+        """
         wanted = {obj: value for obj, value in o.settings(self.axis, timeout).items() if self.has(obj)}
+        if homing:
+            wanted = {o.HIGHEST: wanted[o.HIGHEST] - 1} | {obj: value for obj, value in wanted.items() if obj != o.HIGHEST}
         for obj, value in wanted.items():
             self.write(obj, value)
         for pdo in self.pdos:
@@ -235,10 +266,17 @@ class Drive:
                 what = f"its home was not found under this configuration: {obj} is {found}, not {wanted[obj]}"
                 raise Refused(f"{self}: {what}\n  what to do: torchcmax rig home")
 
-    def home_is(self, known: bool) -> None:
-        """While home is being looked for the upper soft limit is another, by which `believed` sees a search that was not finished."""
-        highest = o.settings(self.axis, 0.0)[o.HIGHEST]
-        self.write(o.HIGHEST, highest if known else highest - 1)
+    def found_home(self) -> None:
+        """Let `believed` see that the search for home ended well."""
+        self.write(o.HIGHEST, o.settings(self.axis, 0.0)[o.HIGHEST])
+
+    def wake(self) -> None:
+        """A node that NMT has stopped, as the host does with drives that it hears no more, answers no SDO before it is pre-operational."""
+        try:
+            self.read(o.STATUSWORD)
+        except LinkLost:
+            with bus():
+                self.node.nmt.send_command(o.PREPARE)
 
     def unwatch(self) -> None:
         """Let it not notice the host's silence, which would be its next fault: only for a drive that is disabled."""

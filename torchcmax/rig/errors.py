@@ -27,6 +27,10 @@ class LinkLost(RigError):
     code = 4
 
 
+class Unanswered(LinkLost):
+    """A drive leaves too much unanswered, though not all: it still does what it is told."""
+
+
 class Aborted(RigError):
     """The user ended it."""
 

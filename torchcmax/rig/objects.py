@@ -18,6 +18,7 @@ FORMATS = {"i8": "<b", "u8": "<B", "i16": "<h", "u16": "<H", "i32": "<i", "u32":
 VENDOR = 0xFB  # maxon motor ag
 MASTER = 0x7F  # node of the host, whose heartbeat the drives watch
 INSIDE = 10  # quadcounts from a soft limit to the home at its end: a switch that was left closes again farther out
+BEGIN, END, PREPARE = 1, 2, 0x80  # NMT commands of CiA 301: operational, stopped, pre-operational
 OFF, NO_REMOTE = 1 << 31, 1 << 30  # of a COB-ID: the PDO does not exist; nobody may ask for it by a remote frame
 
 

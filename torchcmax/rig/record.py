@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from torchcmax.rig.errors import Refused, RigError
 from torchcmax.rig.objects import from_rpm
 
 if TYPE_CHECKING:  # what reads records needs no bus
-    from torchcmax.rig.drive import Drive
+    from torchcmax.rig.drive import Drive, Told
 
 ENCODER, LOG, RUN = "encoder.csv", "log.jsonl", "run.json"
 COLUMNS = "k,t_drive_s,axis,pos_qc,x,v,current_a,following_qc,statusword"
@@ -53,7 +53,9 @@ class Recorder:
         self.rig, self.simulated, self.out = rig, simulated, out
         self.every = max(1, round(1 / (rig.rate * rig.bus.sync_period)))
         self.last: deque[str] = deque(maxlen=LAST)
-        self.first = self.began = self.apart = 0.0  # s: the record's beginning by the interface's and the host's clock; their difference
+        self.first: tuple[float, float] | None = None  # s: the record's beginning by the interface's and the host's clock
+        self.apart = 0.0  # s by which the former has gone on more than the latter
+        self.stamps = [-math.inf for _ in rig.axes]  # s, of the latest samples
         self.events: list[dict[str, Any]] = []
         self.taken = -1
         self.part = out / f".{ENCODER}.{os.getpid()}.part"
@@ -69,7 +71,7 @@ class Recorder:
             self.note(k, "not answered", axes=silent)
             return
         self.taken = k
-        when = k * self.rig.bus.sync_period if self.simulated else self._since(drives[0].told.stamp)
+        when = k * self.rig.bus.sync_period if self.simulated else self._since([drive.told for drive in drives])
         for drive in drives:
             told, axis = drive.told, drive.axis
             x, v = float(from_quadcounts(axis, told.position)), from_rpm(axis, told.velocity)
@@ -81,16 +83,19 @@ class Recorder:
             except OSError as error:
                 raise _unwritten(self.part, error) from error
 
-    def _since(self, stamp: float) -> float:
-        """s since the record began; RigError where the clock that tells so was set meanwhile."""
-        now = time.monotonic()
-        if not self.first:
-            self.first, self.began = stamp, now
-        before, self.apart = self.apart, (stamp - self.first) - (now - self.began)
+    def _since(self, told: list[Told]) -> float:
+        """s since the record began; RigError where the clock that tells so stands, or was set meanwhile."""
+        stamp, heard = told[0].stamp, told[0].heard
+        self.first = self.first or (stamp, heard)
+        before, self.apart = self.apart, (stamp - self.first[0]) - (heard - self.first[1])
         if abs(self.apart - before) > STEP:
             remedy = "let no time service set this machine's clock while the rig runs (slewing is no harm)"
             raise RigError(f"the interface's clock jumped by {self.apart - before:.3f} s, and times are of no use\n  what to do: {remedy}")
-        return stamp - self.first
+        before_that, self.stamps = self.stamps, [each.stamp for each in told]
+        if not all(now > then for now, then in zip(self.stamps, before_that, strict=True)):
+            remedy = "take an interface that stamps what it receives (socketcan), or a longer sync_period_s"
+            raise RigError(f"the interface's clock does not go on from SYNC to SYNC, at {stamp:.6f} s\n  what to do: {remedy}")
+        return stamp - self.first[0]
 
     def note(self, k: int, what: str, **more: Any) -> None:
         """An event for the log."""
@@ -152,7 +157,8 @@ def read_encoder(path: Path | str, rig: Rig) -> Encoder:
         except ValueError as error:
             raise Refused(f"{file}, line {number}: {error}\n  what to do: {remedy}") from error
     if not columns or len(columns) % len(names):
-        raise Refused(f"{file}: ends in the middle of a sample\n  what to do: {remedy}")
+        what = "ends in the middle of a sample" if columns else "holds no sample"
+        raise Refused(f"{file}: {what}\n  what to do: {remedy}")
     table = np.array(columns).reshape(-1, len(names), width - 1)
     k, when = table[:, 0, 0], table[:, 0, 1]
     came = table[..., 8] - table[:1, :1, 8] + when[0] if width > len(COLUMNS.split(",")) else np.repeat(when[:, None], len(names), 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -116,17 +116,8 @@ def check(rig: Rig, *, simulate: bool, seconds: float = 1.0, network: canopen.Ne
             return check(rig, simulate=simulate, seconds=seconds, network=made)
     found: dict[str, Any] = {}
     for axis in rig.axes:
-        drive = Drive(network, axis, rig.bus.sync_period)
-        state = o.state_of(drive.read(o.STATUSWORD))
-        wanted = {obj: value for obj, value in o.settings(axis, rig.bus.heartbeat_timeout).items() if drive.has(obj)}
-        found[axis.name] = {
-            **drive.identify(set()),
-            "modes": o.bits(drive.read(o.SUPPORTED)),
-            "state": None if state is None else state.value,
-            "homed": bool(drive.read(o.STATUSWORD) & o.HOMED),
-            "errors": [o.error_text(code) for code in drive.history()],
-            "differs": {str(obj): [value, read] for obj, value in wanted.items() if (read := drive.read(obj)) != value},
-        }
+        with closing(Drive(network, axis, rig.bus.sync_period)) as drive:
+            found[axis.name] = _described(rig, drive)
     late, period = [], rig.bus.sync_period
     due = time.monotonic()
     for _ in range(round(seconds / period)):
@@ -135,6 +126,20 @@ def check(rig: Rig, *, simulate: bool, seconds: float = 1.0, network: canopen.Ne
         late.append(max(0.0, time.monotonic() - due))
     found["sync_delay_p99_s"] = float(np.quantile(late, 0.99))
     return found
+
+
+def _described(rig: Rig, drive: Drive) -> dict[str, Any]:
+    drive.wake()
+    state = o.state_of(drive.read(o.STATUSWORD))
+    wanted = {obj: value for obj, value in o.settings(drive.axis, rig.bus.heartbeat_timeout).items() if drive.has(obj)}
+    return {
+        **drive.identify(set()),
+        "modes": o.bits(drive.read(o.SUPPORTED)),
+        "state": None if state is None else state.value,
+        "homed": bool(drive.read(o.STATUSWORD) & o.HOMED),
+        "errors": [o.error_text(code) for code in drive.history()],
+        "differs": {str(obj): [value, read] for obj, value in wanted.items() if (read := drive.read(obj)) != value},
+    }
 
 
 def _armed(simulate: bool, arm: bool) -> None:
@@ -167,7 +172,8 @@ def _session(
                 session.configure(homing=o.HOMING in modes)
                 work(session, said)
         except BaseException as error:
-            said["status"] = f"aborted: {error}" if isinstance(error, RigError) else f"aborted: {type(error).__name__}: {error}"
+            told = [str(error) if isinstance(error, RigError) else f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])]
+            said["status"] = "aborted: " + "\n".join(told)
             said["last"] = list(recorder.last)
             raise
         finally:

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from types import FrameType, TracebackType
@@ -16,9 +16,10 @@ from typing import Any
 import canopen
 
 from torchcmax.rig import objects as o
+from torchcmax.rig.axis import drivable
 from torchcmax.rig.config import Rig
 from torchcmax.rig.drive import Drive, bus
-from torchcmax.rig.errors import Aborted, DriveFault, LinkLost, Refused, RigError
+from torchcmax.rig.errors import Aborted, DriveFault, LinkLost, Refused, RigError, Unanswered
 from torchcmax.rig.objects import State
 from torchcmax.rig.program import Move, Program
 from torchcmax.rig.record import Recorder
@@ -26,14 +27,15 @@ from torchcmax.rig.simnode import HEARTBEAT, OPERATIONAL, SYNC
 from torchcmax.rig.thermal import TwoBody
 
 LOST = (5, 0.02)  # periods, s without an answer, the longer of which means that a drive is lost
-MISSING = (10, 0.01)  # SYNCs, and part of all, that a drive may leave unanswered now and then
+MISSING = (10.0, 0.01)  # s, and part of their SYNCs that a drive may leave unanswered
 STALL = 0.05  # s by which the host may be late while axes are on
 FIRST_TIME, ENABLE_TIME, MODE_TIME, ANSWER_TIME, ARRIVE_TIME, HOME_TIME = 0.5, 5.0, 1.0, 0.1, 2.0, 120.0  # s; EPOS2 finds its commutation
-RESET_TIME, OFF_TIME, STAND_TIME = 0.5, 1.0, 0.01  # s
+RESET_TIME, OFF_TIME, STAND_TIME = 0.5, 1.0, 0.02  # s
 BEYOND = {"linear": 1e-3, "rotary": math.radians(0.1)}  # of a soft limit, that the host does not accept
 FASTER, COOLER = 1.1, 5.0  # times the limit of the speed; K below the winding's limit: where the host stops
-ECHO = 10  # frames that an interface may still have to give back, where it does
+ECHO_TIME = 0.05  # s, in which an interface that gives back what is sent has given back most of it
 TURN = 4  # SYNCs before a move by which its mode is sent
+WITHOUT_VOLTAGE = (State.DISABLED, State.FAULT)
 Watch = Callable[[int], object]
 
 
@@ -64,6 +66,7 @@ class Session:
 
     network: with the drives on it | paced: in real time, else as fast as it goes | watch: is called after every tick with its number
     k: number of the last SYNC, by the time: one that was not sent in time counts too, and is among `late`
+    echo: whether the interface gives back what is sent, None before that is known | off: all drives have been seen without voltage
     allowed: the state in which every drive has to be now, None while that changes
     """
 
@@ -73,9 +76,11 @@ class Session:
         self.rig, self.network, self.recorder, self.guard, self.paced, self.watch = rig, network, recorder, guard, paced, watch
         self.drives = [Drive(network, axis, rig.bus.sync_period) for axis in rig.axes]
         self.k, self.begin, self.before, self.ticks, self.late = -1, 0, -1, 0, 0
-        self.recording = self.limited = self.stopping = self.armed = False
+        self.recording = self.limited = self.stopping = self.armed = self.off = False
+        self.echo: bool | None = None
         self.allowed: State | None = None
         self.homed: set[int] = set()  # axes whose places are to be believed
+        self.found: set[int] = set()  # those that have found home just now
         self.moves: dict[int, Move] = {}  # the last one of every axis
         self.waiting: dict[int, tuple[bool, int]] = {}  # axes with a set point: whether its answer has to come or go, since when
         self.beaten = -math.inf  # s, when the last heartbeat was sent
@@ -122,7 +127,7 @@ class Session:
         self._say(SYNC, b"")
         self._answers()
         for drive in self.drives:
-            drive.count()
+            drive.count(self.k)
         self._record()
         for drive in self.drives:
             if not self.stopping:
@@ -177,7 +182,7 @@ class Session:
         """What a drive tells, and what it leaves untold."""
         drive.check()
         for cob_id, count in self.sent.items():
-            if self.heard[cob_id] > count or 0 < self.heard[cob_id] < count - ECHO:
+            if self.heard[cob_id] > (0 if self.echo is False else count):
                 remedy = "end that program, or give the rig its own bus"
                 raise DriveFault(
                     f"somebody else on this bus sends {'SYNCs' if cob_id == SYNC else 'heartbeats'} as its host\n  what to do: {remedy}"
@@ -185,9 +190,13 @@ class Session:
         if self.allowed is not None and drive.complete and drive.state is not self.allowed:
             remedy = "look for an input, a key or another program that commands the drive, and at safe torque off"
             raise DriveFault(f"{drive}: is {drive.says}, not {self.allowed.value}, and nobody asked for it\n  what to do: {remedy}")
-        if drive.unanswered > MISSING[0] + MISSING[1] * self.ticks:
+        window = round(MISSING[0] / self.period)
+        while drive.silent and drive.silent[0] <= self.k - window:
+            drive.silent.popleft()
+        if len(drive.silent) > MISSING[1] * window:
             remedy = "look at cable, termination and the load of the bus, or give it more time: sync_period_s"
-            raise LinkLost(f"{drive}: has not answered {drive.unanswered} of {self.ticks} SYNCs\n  what to do: {remedy}")
+            last = min(self.ticks, window)
+            raise Unanswered(f"{drive}: has not answered {len(drive.silent)} of the last {last} SYNCs\n  what to do: {remedy}")
 
     def _limit(self) -> None:
         """The host's own limits, with some room about those of the drives; of places where home is known."""
@@ -216,18 +225,33 @@ class Session:
             if wrong is not None:
                 raise DriveFault(f"{drive}: {wrong}\n  what to do: look for what is in its way, or plan a gentler motion")
 
+    def ticks_of(self, seconds: float) -> Iterator[None]:
+        """Tick for so long, once at least."""
+        end = self.k + max(1, round(seconds / self.period))
+        while self.k < end:
+            self.tick()
+            yield
+
+    def rest(self, seconds: float) -> None:
+        """Only tick."""
+        for _ in self.ticks_of(seconds):
+            pass
+
+    def within(self, seconds: float, done: Callable[[], bool]) -> bool:
+        """Tick until something is so: whether it is in time."""
+        return any(done() for _ in self.ticks_of(seconds))
+
     def until(self, done: Callable[[], bool], seconds: float, what: Callable[[], str]) -> None:
         """Tick until something is so; DriveFault where it is not in time."""
-        for _ in range(max(1, math.ceil(seconds / self.period))):
-            self.tick()
-            if done():
-                return
-        raise DriveFault(f"{what()} within {seconds:g} s\n  what to do: look at log.jsonl, and at the drive with its maker's program")
+        if not self.within(seconds, done):
+            raise DriveFault(f"{what()} within {seconds:g} s\n  what to do: look at log.jsonl, and at the drive with its maker's program")
 
     # -- getting ready
 
     def connect(self, modes: set[int]) -> list[dict[str, int]]:
         """Who is there; Refused, or DriveFault, where that is not as it must be."""
+        for drive in self.drives:
+            drive.wake()
         return [drive.identify(modes) for drive in self.drives]
 
     def healthy(self, reset: bool) -> None:
@@ -258,34 +282,35 @@ class Session:
 
     def configure(self, homing: bool) -> None:
         """Limits, supervision and PDOs, read back; then the drives listen to PDOs.  homing: whether home is going to be found now."""
-        self._command(0x80)
+        self._command(o.PREPARE)
         for drive in self.drives:
             if not homing:
                 drive.believed()
-            self.recorder.note(self.k, "configured", axis=drive.axis.name, values=drive.configure(self.rig.bus.heartbeat_timeout))
-            if homing:
-                drive.home_is(known=False)
+            values = drive.configure(self.rig.bus.heartbeat_timeout, homing)
+            self.recorder.note(self.k, "configured", axis=drive.axis.name, values=values)
             drive.forget()
         self.allowed, self.armed = State.DISABLED, True
-        self._command(1)
+        self._command(o.BEGIN)
         self.due = time.monotonic()
         self._first()
 
     def _first(self) -> None:
         """SYNCs until every drive has answered one, which takes a while where it has just begun to listen."""
-        for _ in range(math.ceil(FIRST_TIME / self.period)):
-            self.tick()
+        for _ in self.ticks_of(FIRST_TIME):
             if all(drive.complete for drive in self.drives):
                 break
             for drive in self.drives:
-                drive.missed = drive.unanswered = 0
+                drive.missed = 0
+                drive.silent.clear()
         for drive in self.drives:
             if not drive.complete:
                 raise LinkLost(f"{drive}: answers no SYNC\n  what to do: look at the bus for who else sends on it")
-            drive.unanswered = 0
+            drive.pardon()
+        self.rest(ECHO_TIME)
+        self.echo = 2 * self.heard[SYNC] > self.sent[SYNC]
 
     def _command(self, code: int) -> None:
-        """An NMT command to each drive: 1 operational, 2 stop, 0x80 pre-operational."""
+        """An NMT command to each drive."""
         for drive in self.drives:
             with bus():
                 drive.node.nmt.send_command(code)
@@ -295,13 +320,9 @@ class Session:
         self.limited = True
         for drive in self.drives:
             drive.turn(mode)
-        try:
-            self.until(lambda: all(drive.told.mode == mode for drive in self.drives), MODE_TIME, lambda: "a mode was not taken")
-        except DriveFault:
+        if not self.within(MODE_TIME, lambda: all(drive.told.mode == mode for drive in self.drives)):
             refused = ", ".join(f"{drive}: mode {o.MODES[mode]}" for drive in self.drives if drive.told.mode != mode)
-            if not refused:
-                raise
-            raise Refused(f"{refused} is refused\n  what to do: look at the drive's set-up") from None
+            raise Refused(f"{refused} is refused\n  what to do: look at the drive's set-up")
         if self.allowed is State.ENABLED:
             return
         self.allowed = None
@@ -333,18 +354,19 @@ class Session:
             drive.control(o.ENABLE)
             self.until(partial(self.stands, drive), ARRIVE_TIME, partial("{}: did not stand".format, drive))
             self.recorder.note(self.k, "homed", axis=drive.axis.name, position=drive.told.position)
-            drive.home_is(known=True)
             self.homed.add(i)
+            self.found.add(i)
 
     # -- moving
 
     def go(self, places: tuple[float, ...]) -> None:
         """All axes to their places, slowly: at the speed of homing."""
+        speeds = [drivable(axis, axis.homing.speed) for axis in self.rig.axes]
         moves = [
-            Move(TURN * self.period, i, "position", x, axis.homing.speed, o.gentle(axis))
-            for i, (axis, x) in enumerate(zip(self.rig.axes, places, strict=True))
+            Move(TURN * self.period, i, "position", x, speed, o.gentle(axis))
+            for i, (axis, x, speed) in enumerate(zip(self.rig.axes, places, speeds, strict=True))
         ]
-        far = max(abs(d.place - x) / d.axis.homing.speed for d, x in zip(self.drives, places, strict=True))
+        far = max(abs(d.place - x) / speed for d, x, speed in zip(self.drives, places, speeds, strict=True))
         self.follow(Program(tuple(moves), places, far + 1.0))
 
     def ready(self, program: Program) -> None:
@@ -357,14 +379,15 @@ class Session:
     def follow(self, program: Program) -> None:
         """The moves of a program, each at its SYNC, until all axes have arrived.
 
-        No move begins before the axis has arrived from the one before: what is late, as the host may be, delays all that follows.
+        No move begins before the axis has arrived from the one before: while one has to wait, and where the host is late, the program's
+        time stands (`lag`), so that all that follows is as much later.
         A velocity is ended as many SYNCs as planned after it really began, so that it goes no farther.
         """
         first, lag, blocked = self.k + 1, 0, 0
         pending = sorted(program.moves, key=lambda move: move.start)
         queues = [deque(move for move in pending if move.axis == i) for i in range(len(self.drives))]
         turned: dict[int, Move] = {}
-        begun: dict[int, tuple[Move, int]] = {}
+        begun: dict[int, tuple[Move, int, float]] = {}  # the last move of an axis, its SYNC, and the velocity before
 
         def runs(i: int) -> bool:
             return i in begun and begun[i][0].kind == "velocity" and begun[i][0].v != 0
@@ -372,7 +395,7 @@ class Session:
         def due(move: Move) -> int:
             if not runs(move.axis):
                 return first + lag + round(move.start / self.period)
-            before, k = begun[move.axis]
+            before, k, _ = begun[move.axis]
             return k + round((move.start - before.start) / self.period)
 
         while any(queues) or self.waiting or self.k < first + lag + round(program.duration / self.period):
@@ -382,23 +405,26 @@ class Session:
                 if turned.get(move.axis) is not move and due(move) - TURN <= self.k + 1 and arrived:
                     self._turn(move)
                     turned[move.axis] = move
-            now = [move for move in heads if due(move) <= self.k + 1]
-            begins = [move for move in now if not runs(move.axis)]
-            if any(turned.get(move.axis) is not move or self._busy(move) for move in begins):
-                now = [move for move in now if move not in begins]  # together or not at all
-                blocked += 1
+            now = [move for move in heads if runs(move.axis) and due(move) <= self.k + 1]
+            idle = [move for move in heads if not runs(move.axis)]
+            due_first = min(map(due, idle), default=math.inf)
+            begins = [move for move in idle if due(move) == due_first <= self.k + 1]
+            waits = any(turned.get(move.axis) is not move or self._busy(move) for move in begins)  # together or not at all
+            now += [] if waits else begins
+            for move in now:
+                self._start(move)
+                queues[move.axis].popleft()
+            before = self.k
+            self.tick()
+            if waits:
+                lag, blocked = lag + self.k - before, blocked + self.k - before
                 if blocked * self.period > ARRIVE_TIME:
                     raise DriveFault(f"{', '.join(map(self._late, begins))}\n  what to do: look at log.jsonl and motion.png")
             elif begins:
-                lag, blocked = lag + self.k + 1 - due(begins[0]), 0
+                lag, blocked = lag + self.k - round(due_first), 0
             for move in now:
-                self._start(move)
-                begun[move.axis] = move, self.k + 1
-                queues[move.axis].popleft()
-            self.tick()
-            for move in now:
-                if move.kind == "velocity":  # once more, for firmware that takes controlword and velocity in this order
-                    self.drives[move.axis].control(o.ENABLE)
+                begun[move.axis] = move, self.k, begun[move.axis][0].v if runs(move.axis) else 0.0
+                self._started(move)
             self._answered()
             for i in filter(runs, begun):
                 self._keeps(i, *begun[i])
@@ -433,12 +459,18 @@ class Session:
     def _start(self, move: Move) -> None:
         """With the next SYNC."""
         drive = self.drives[move.axis]
-        self.recorder.note(self.k + 1, "move", axis=drive.axis.name, kind=move.kind, target=move.target, v=move.v, a=move.a)
         drive.aim(move)
         drive.control(o.AT_ONCE if move.kind == "position" else o.ENABLE)
+        self.moves[move.axis] = move
+
+    def _started(self, move: Move) -> None:
+        """With the SYNC that has just been."""
+        drive = self.drives[move.axis]
+        self.recorder.note(self.k, "move", axis=drive.axis.name, kind=move.kind, target=move.target, v=move.v, a=move.a)
         if move.kind == "position":
             self.waiting[move.axis] = True, self.k
-        self.moves[move.axis] = move
+        else:  # once more, for firmware that takes controlword and velocity in this order
+            drive.control(o.ENABLE)
 
     def _answered(self) -> None:
         """The hand-shake of set points: answered, taken back, and the answer too."""
@@ -453,19 +485,14 @@ class Session:
             else:
                 del self.waiting[i]
 
-    def _keeps(self, i: int, move: Move, began: int) -> None:
-        """DriveFault where an axis has not the velocity that it should have reached by now."""
+    def _keeps(self, i: int, move: Move, began: int, before: float) -> None:
+        """DriveFault where an axis has not the velocity that it should have reached by now, from the one before."""
         drive = self.drives[i]
-        reached = abs(move.v) / move.a + ANSWER_TIME
-        room = 0.1 * abs(move.v) + 2 * abs(o.from_rpm(drive.axis, drive.slow))
-        if (self.k - began) * self.period > reached and abs(drive.speed - move.v) > room:
-            what = f"should move at {move.v:.4g} /s, and moves at {drive.speed:.4g}"
+        reached = abs(move.v - before) / move.a + ANSWER_TIME
+        room = 0.1 * max(abs(move.v), abs(before)) + 2 * abs(o.from_rpm(drive.axis, drive.slow))
+        if (self.k - began) * self.period > reached and abs(drive.mean_speed - move.v) > room:
+            what = f"should move at {move.v:.4g} /s, and moves at {drive.mean_speed:.4g}"
             raise DriveFault(f"{drive}: {what}\n  what to do: look for what is in its way, and at the drive's own limits")
-
-    def rest(self, seconds: float) -> None:
-        """Tick for so long."""
-        for _ in range(round(seconds / self.period)):
-            self.tick()
 
     def stands(self, drive: Drive) -> bool:
         return drive.steady * self.period >= STAND_TIME
@@ -473,11 +500,11 @@ class Session:
     # -- coming to an end
 
     def _stop(self, error: BaseException | None) -> None:
-        """Everything stands still and is disabled; what goes wrong now is told to the log, as `error` is the one to be told."""
+        """Everything stands still and is disabled.  Of what goes wrong now the log is told, and `error` where that leaves drives on."""
         self.stopping, self.recording = True, self.recording and error is not None
         self.recorder.note(self.k, "stopping", reason="done" if error is None else f"{type(error).__name__}: {error}")
         try:
-            if isinstance(error, LinkLost):
+            if isinstance(error, LinkLost) and not isinstance(error, Unanswered):
                 raise error
             self._switch_off(error)
         except BaseException as failed:
@@ -485,8 +512,21 @@ class Session:
                 self.recorder.note(self.k, "not stopped as it should", reason=str(failed))
             else:
                 self._let_go(failed)
-            if error is None:
-                raise
+            told = error or failed
+            if not self.off:
+                told = self._unsafe(told, failed)
+            if told is not error:
+                raise told from error
+
+    def _unsafe(self, error: BaseException, failed: BaseException) -> BaseException:
+        """What ended a run, and that its drives have not been seen to stop: a lost link where it was one that kept them from it."""
+        what = "" if failed is error else f": {str(failed).splitlines()[0] if str(failed) else type(failed).__name__}"
+        told = f"  NOT SEEN TO STOP{what}\n  what to do: take the power from it before anybody comes near"
+        if isinstance(error, RigError):
+            kind = LinkLost if isinstance(failed, LinkLost) else type(error)
+            return kind(f"{error}\n{told}")
+        error.add_note(told)
+        return error
 
     def _switch_off(self, error: BaseException | None) -> None:
         """Quick stop, if anything was wrong; then no voltage, seen to be off, and no longer watching for the host."""
@@ -499,46 +539,77 @@ class Session:
             for drive in moving:
                 drive.control(word)
             self.tick()
-        off = (State.DISABLED, State.FAULT)
-        for _ in range(math.ceil(OFF_TIME / self.period)):
-            if all(drive.complete and drive.state in off for drive in self.drives):
-                break
-            self.tick()
+        self.off = self.within(OFF_TIME, lambda: all(drive.complete and drive.state in WITHOUT_VOLTAGE for drive in self.drives))
         self.recorder.note(self.k, "stopped", states=[drive.says for drive in self.drives])
+        refused = self._leave()
         for drive in self.drives:
-            if drive.state not in off:
+            if drive.state not in WITHOUT_VOLTAGE:
                 raise DriveFault(f"{drive}: is not disabled\n  what to do: take the power from it, then look at log.jsonl")
-            if drive.state is State.FAULT:
-                codes = [o.error_text(code) for code in drive.history()]
-                self.recorder.note(self.k, "in its fault state", axis=drive.axis.name, codes=codes)
-        for drive in self.drives:
             if error is None:
                 drive.check()
-            if drive.state is State.DISABLED:
-                drive.unwatch()
+        if refused is not None:
+            raise refused
+
+    def _leave(self) -> RigError | None:
+        """What drives without voltage are told and asked, each whatever becomes of the others -> the first that went wrong.
+
+        They watch for the host no more, and those that have found home may be believed; of a fault the log has the history.
+        """
+        failed: RigError | None = None
+        for i, drive in enumerate(self.drives):
+            try:
+                if drive.state is State.DISABLED:
+                    drive.unwatch()
+                    if i in self.found:
+                        drive.found_home()
+                elif drive.state is State.FAULT:
+                    codes = [o.error_text(code) for code in drive.history()]
+                    self.recorder.note(self.k, "in its fault state", axis=drive.axis.name, codes=codes)
+            except RigError as error:
+                self.recorder.note(self.k, "not told or asked", axis=drive.axis.name, reason=str(error))
+                failed = failed or error
+        return failed
 
     def _stand(self) -> None:
         """Tick until all axes stand, or the user is tired of it."""
         longest = 0.5 + max(2 * drive.axis.limits.v / drive.axis.limits.quick_stop for drive in self.drives)
         for drive in self.drives:
             drive.steady = 0  # before the quick stop has taken hold
-        for _ in range(math.ceil(longest / self.period)):
-            if self.guard.signals > 1 or all(map(self.stands, self.drives)):
-                return
-            self.tick()
+        if self.guard.signals > 1 or self.within(longest, lambda: self.guard.signals > 1 or all(map(self.stands, self.drives))):
+            return
         self.recorder.note(self.k, "does not stand", places=[drive.place for drive in self.drives])
 
     def _let_go(self, lost: BaseException) -> None:
-        """Without answers: no more heartbeat, so that drives stop by themselves; and three times what would stop them now."""
+        """Without answers to SYNCs: no more heartbeat, so that drives stop by themselves; three times what would stop them now; NMT stop.
+
+        Before the third they are asked by SDO, which answers also where a drive has gone pre-operational for want of heartbeats.
+        """
         self.recorder.note(self.k, "link lost", reason=f"{type(lost).__name__}: {lost}")
+        quick = [*(partial(drive.control, o.QUICK) for drive in self.drives), partial(self._say, SYNC, b"")]
         for last in (False, False, True):
-            sends: list[Callable[[], object]] = [partial(drive.control, o.QUICK) for drive in self.drives]
-            sends += [self.network.sync.transmit]
-            sends += [partial(drive.node.nmt.send_command, 2) for drive in self.drives] if last else []
-            for send in sends:
-                try:
-                    send()
-                except Exception as error:
-                    self.recorder.note(self.k, "not sent", reason=f"{type(error).__name__}: {error}")
+            if last:
+                self._try(self._ask)
+            for send in quick:
+                self._try(send)
             if self.paced and not last:  # a queue that is full takes a while to empty
                 time.sleep(STAND_TIME)
+        for drive in self.drives:
+            self._try(partial(drive.node.nmt.send_command, o.END))
+
+    def _try(self, send: Callable[[], object]) -> None:
+        try:
+            send()
+        except Exception as error:
+            self.recorder.note(self.k, "not sent", reason=f"{type(error).__name__}: {error}")
+
+    def _ask(self) -> None:
+        """Whether drives say by SDO that they are without voltage."""
+        on = self.drives
+        for _ in range(math.ceil(OFF_TIME / self.period)):
+            on = [drive for drive in on if o.state_of(drive.read(o.STATUSWORD)) not in WITHOUT_VOLTAGE]
+            if not on:
+                self.off = True
+                return
+            self._say(SYNC, b"")  # they may just be about to take the quick stop
+            if self.paced:
+                time.sleep(self.period)

@@ -26,7 +26,7 @@ from torchcmax.rig.plant import SUBSTEPS, Plant, Ramp
 TYPES = {"i8": objectdictionary.INTEGER8, "u8": objectdictionary.UNSIGNED8, "i16": objectdictionary.INTEGER16,
          "u16": objectdictionary.UNSIGNED16, "i32": objectdictionary.INTEGER32, "u32": objectdictionary.UNSIGNED32}  # fmt: skip
 SYNC, HEARTBEAT = 0x80, 0x700
-OPERATIONAL, PRE_OPERATIONAL = 5, 127
+STOPPED, OPERATIONAL, PRE_OPERATIONAL = 4, 5, 127
 NEAR = 4  # quadcounts from its target at which an axis has arrived
 SLOW = 0.5  # rad/s of the motor: stands
 HISTORY = 5  # entries of 0x1003
@@ -275,7 +275,7 @@ class SimulatedDrive:
             self.heard = self.time
 
     def _on_sdo(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        if not self.faults.dropped:
+        if not self.faults.dropped and self.node.nmt._state != STOPPED:
             self.node.sdo.on_request(can_id, data, timestamp)
 
     def _on_nmt(self, can_id: int, data: bytearray, timestamp: float) -> None:
