@@ -27,6 +27,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from torchcmax import __version__, kernels
@@ -222,8 +223,11 @@ def flow_steps(recording: Recording, window: Window, device: str) -> Table:
         flow.grad = None
         loss(window, flow).backward()
 
+    def scattered(xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+        return vote_scatter(torch.addcmul(xy, motion, s[..., None]), weight, size)
+
     fast = {name: best(step, device)[i] for i, name in enumerate(("wall", "CPU"))}
-    with patch("torchcmax.nn.flow.vote", vote_scatter):
+    with patch("torchcmax.nn.flow.vote_moved", scattered):
         votes = {name: best(step, device)[i] for i, name in enumerate(("wall", "CPU"))}
         with patch("torchcmax.nn.loss.blur", blur_twin):
             plain = {name: best(step, device)[i] for i, name in enumerate(("wall", "CPU"))}

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcmax import kernels
+
 BILINEAR, ZEROS, ALIGN_CORNERS = 0, 0, True  # how aten spells the options of grid_sample
 
 
@@ -49,6 +51,46 @@ def vote(xy: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
         return vote_scatter(xy, weight, size)
     image: Tensor = _Vote.apply(xy, weight, size)
     return image
+
+
+def vote_moved(xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+    """`vote` of points that go on in a straight line, xy + s motion.
+
+    xy, motion [B, N, 2] px | s, weight [B, N] | size (H, W) -> [B, H, W].  By the CPU's kernels, where it has any; differentiable once.
+    """
+    _check(xy, weight)
+    if motion.shape != xy.shape or s.shape != weight.shape:
+        raise ValueError(f"vote_moved wants motion [B, N, 2] and s [B, N] as xy and weight, got {[*motion.shape]} and {[*s.shape]}")
+    if _kernels(xy, weight, size) is None or xy.requires_grad or s.requires_grad:
+        return vote_moved_twin(xy, motion, s, weight, size)
+    image: Tensor = _VoteMoved.apply(xy, motion.to(xy), s.to(xy), weight, size)
+    return image
+
+
+def vote_moved_twin(xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+    """The readable twin of `vote_moved`."""
+    return vote(torch.addcmul(xy, motion, s[..., None]), weight, size)
+
+
+class _VoteMoved(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+        ctx.save_for_backward(xy, motion, s, weight)
+        ctx.fast = _kernels(xy, weight, size)
+        image: Tensor = ctx.fast.vote_moved(xy, motion, s, weight, size)
+        return image
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor | None, None, Tensor | None, None]:
+        to_motion, to_weight = ctx.fast.vote_moved_slopes(*ctx.saved_tensors, gradient, ctx.needs_input_grad[1:4:2])
+        return None, to_motion, None, to_weight, None
+
+
+def _kernels(xy: Tensor, weight: Tensor, size: tuple[int, int]) -> Any:
+    """The CPU's for such points and such an image, None where there are none, or torch.compile looks on."""
+    alike = xy.device.type == weight.device.type == "cpu" and xy.dtype == weight.dtype
+    return kernels.drawing(xy, (size[0] + 2) * (size[1] + 2)) if alike and not torch.compiler.is_compiling() else None
 
 
 class _Vote(torch.autograd.Function):

@@ -112,6 +112,37 @@ def slopes_sum(H_k: Tensor, ink: Any, canvas: Any, gradient: Tensor) -> Tensor:
     return torch.from_numpy(totals).to(H_k)
 
 
+def vote_moved(xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+    """`core.vote.vote_moved` without its derivative: xy, motion [B, N, 2] | s, weight [B, N] -> [B, H, W]."""
+    points, edge = [_array(part) for part in (xy, motion, s, weight)], _edge(size, xy)
+    frames = xy.new_zeros(len(xy), size[0] + 2, size[1] + 2)
+    flat = frames.view(len(xy), -1).numpy()
+    _spread(lambda i: events.vote(*(part[i] for part in points), edge, flat[i]), [(i,) for i in range(len(xy))])
+    return frames[:, 1:-1, 1:-1].contiguous()
+
+
+def vote_moved_slopes(
+    xy: Tensor, motion: Tensor, s: Tensor, weight: Tensor, gradient: Tensor, wanted: tuple[bool, bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    """The derivative of `vote_moved` to motion [B, N, 2] and weight [B, N], each where it is wanted: gradient = dL/dI [B, H, W]."""
+    points, edge = [_array(part) for part in (xy, motion, s, weight)], _edge(gradient.shape[1:], xy)
+    frames = _array(framed(gradient.to(xy))).reshape(len(xy), -1)
+    count = xy.shape[1]
+    to_motion, to_weight = xy.new_empty(len(xy), count * wanted[0], 2), xy.new_empty(len(xy), count * wanted[1])
+    found = to_motion.numpy(), to_weight.numpy()
+
+    def work(i: int) -> None:
+        events.vote_slopes(*(part[i] for part in points), edge, frames[i], *(part[i] for part in found))
+
+    _spread(work, [(i,) for i in range(len(xy))])
+    return to_motion if wanted[0] else None, to_weight if wanted[1] else None
+
+
+def _edge(size: Sequence[int], like: Tensor) -> Array:
+    """Right, bottom and stride of the frame around an image."""
+    return np.array([size[1] + 1, size[0] + 1, size[1] + 2], "f4" if like.dtype == torch.float32 else "f8")
+
+
 def sharpness(H_k: Tensor, view: Any, owner: Tensor, contrast: str) -> Tensor:
     """Normalized contrast of the blurred image of warped events on a pinhole canvas: H_k [A, K, 3, 3] | owner [A] -> [A]."""
     H, code, scene_of = _array(H_k.to(view.ink.x)), image.CONTRASTS.index(contrast), _scenes(view, view.ink.x.new_zeros(len(view.ink.x), 3))

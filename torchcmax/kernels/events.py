@@ -175,6 +175,61 @@ def look(pixel, share, stride, frame):
 
 
 @compiled
+def follow(xy, motion, s, weight, edge, pixel, share):
+    """`land` of points that move within the image: xy + s motion [n, 2] px | edge: right, bottom, stride of the frame."""
+    right, bottom, stride = edge[0], edge[1], edge[2]
+    zero, one = edge.dtype.type(0), edge.dtype.type(1)
+    for i in range(len(weight)):  # columns first, so that the next loop computes eight at once
+        share[0, i], share[1, i] = xy[i, 0] + s[i] * motion[i, 0], xy[i, 1] + s[i] * motion[i, 1]
+    for i in range(len(weight)):
+        px, py = share[0, i] + one, share[1, i] + one
+        inside = (px > zero) & (px < right) & (py > zero) & (py < bottom)  # not where it is nan
+        px, py = px if inside else zero, py if inside else zero
+        column, row = np.floor(px), np.floor(py)
+        pixel[i] = np.int32(row * stride + column)
+        share[0, i], share[1, i] = px - column, py - row
+        share[2, i] = weight[i] if inside else zero
+
+
+@compiled
+def vote(xy, motion, s, weight, edge, frame):
+    """Add the weights [N] of points that have moved by s motion to the frame [(H + 2) (W + 2)]."""
+    pixel, share = np.empty(BLOCK, np.int32), np.empty((3, BLOCK), xy.dtype)
+    last = count(weight)
+    for i in range(0, last, BLOCK):
+        end = min(i + BLOCK, last)
+        follow(xy[i:end], motion[i:end], s[i:end], weight[i:end], edge, pixel, share)
+        scatter(pixel[: end - i], share, edge[2], frame)
+
+
+@compiled
+def read(pixel, share, stride, frame, value):
+    """The derivative of `scatter` to its weights: dL/dframe at the points."""
+    one, step = np.uint64(1), np.uint64(stride)
+    for i in range(len(pixel)):
+        p, fx, fy = np.uint64(pixel[i]), share[0, i], share[1, i]
+        q = p + step
+        above, below = frame[p] + fx * (frame[p + one] - frame[p]), frame[q] + fx * (frame[q + one] - frame[q])
+        value[i] = above + fy * (below - above)
+
+
+@compiled
+def vote_slopes(xy, motion, s, weight, edge, frame, to_motion, to_weight):
+    """The derivative of `vote`: frame = dL/dframe, whose border is 0 | to_motion [N, 2], to_weight [N], empty where not wanted."""
+    pixel, share = np.empty(BLOCK, np.int32), np.empty((3, BLOCK), xy.dtype)
+    for i in range(0, len(weight), BLOCK):
+        end = min(i + BLOCK, len(weight))
+        n = end - i
+        follow(xy[i:end], motion[i:end], s[i:end], weight[i:end], edge, pixel, share)
+        if len(to_weight):
+            read(pixel[:n], share, edge[2], frame, to_weight[i:end])
+        if len(to_motion):
+            look(pixel[:n], share, edge[2], frame)
+            for j in range(n):
+                to_motion[i + j, 0], to_motion[i + j, 1] = s[i + j] * share[0, j], s[i + j] * share[1, j]
+
+
+@compiled
 def gather(slope, x, y, s, s_0, near):
     """The derivative of `carry`: sums over the events of slope [3, n] times (x, y, 1), times 1, u and u^2."""
     for r in range(3):

@@ -11,7 +11,7 @@ from torch.nn.functional import grid_sample
 
 from torchcmax.core.camera import Camera, Canvas
 from torchcmax.core.objective import ContrastName
-from torchcmax.core.vote import vote
+from torchcmax.core.vote import vote_moved
 from torchcmax.core.window import Window
 from torchcmax.nn.image import Polarity, votes
 from torchcmax.nn.loss import Against, Reduction, _check, as_loss, reduced, sharpness
@@ -65,28 +65,27 @@ class FlowContrastLoss(Module):
         if flow.shape != (len(window), 2, *self.canvas.size):
             raise ValueError(f"flow wants [B, 2, H, W] = {[len(window), 2, *self.canvas.size]}, got {[*flow.shape]}")
         with torch.autocast(window.ray.device.type, enabled=False):
-            counts, xy = votes(window, weight, self.polarity), self.canvas.pixels(window.ray)
+            counts, here = votes(window, weight, self.polarity), self.around.pixels(window.ray)
             flow = torch.where((counts != 0).flatten(1).any(1)[:, None, None, None], flow.to(window.ray), 0.0)
-            moved = sampled(flow, xy)
-            total = torch.stack([self._contrast(window, xy, moved, counts, reference) for reference in self.references]).mean(0)
+            moved = sampled(flow, self.canvas.pixels(window.ray))
+            total = torch.stack([self._contrast(window, here, moved, counts, reference) for reference in self.references]).mean(0)
             rest = None
             if self.against == "rest":
-                rest = self._contrast(window, xy, torch.zeros_like(moved), counts, 0.0)
+                rest = self._contrast(window, here, torch.zeros_like(moved), counts, 0.0)
             return reduced(as_loss(total, rest, self.against), self._cost(flow), counts, self.reduction)
 
     def image(self, window: Window, flow: Tensor, weight: Tensor | None = None, reference: float = 0.5) -> Tensor:
         """The image of events that followed the flow to a reference time: [B, C, H, W] of the sensor with its margin."""
-        counts, xy = votes(window, weight, self.polarity), self.canvas.pixels(window.ray)
-        return self._image(window, xy, sampled(flow.to(window.ray), xy), counts, reference)
+        counts, moved = votes(window, weight, self.polarity), sampled(flow.to(window.ray), self.canvas.pixels(window.ray))
+        return self._image(window, self.around.pixels(window.ray), moved, counts, reference)
 
-    def _contrast(self, window: Window, xy: Tensor, moved: Tensor, counts: Tensor, reference: float) -> Tensor:
-        image = self._image(window, xy, moved, counts, reference)
+    def _contrast(self, window: Window, here: Tensor, moved: Tensor, counts: Tensor, reference: float) -> Tensor:
+        image = self._image(window, here, moved, counts, reference)
         return sharpness(image, counts, self.contrast, self.blur, self.against != "nothing")
 
-    def _image(self, window: Window, xy: Tensor, moved: Tensor, counts: Tensor, reference: float) -> Tensor:
-        edge = xy.new_tensor([a - b for a, b in zip(self.around.centre, self.canvas.centre, strict=True)])
-        there = torch.addcmul(xy + edge, moved, (reference - window.phase)[..., None])
-        return torch.stack([vote(there, one, self.around.size) for one in counts.unbind(1)], 1)
+    def _image(self, window: Window, here: Tensor, moved: Tensor, counts: Tensor, reference: float) -> Tensor:
+        since = reference - window.phase
+        return torch.stack([vote_moved(here, moved, since, one, self.around.size) for one in counts.unbind(1)], 1)
 
     def _cost(self, flow: Tensor) -> Tensor:
         """Smoothness and guard: [B]."""
@@ -108,4 +107,4 @@ def sampled(flow: Tensor, xy: Tensor) -> Tensor:
     """The flow [B, 2, H, W] at points [B, N, 2] px, between pixels bilinear, beyond the image that of its border: -> [B, N, 2]."""
     height, width = flow.shape[2:]
     grid = xy * xy.new_tensor([2 / (width - 1), 2 / (height - 1)]) - 1
-    return grid_sample(flow, grid[:, None], padding_mode="border", align_corners=True)[:, :, 0].mT
+    return grid_sample(flow, grid[:, None], padding_mode="border", align_corners=True)[:, :, 0].mT.contiguous()
